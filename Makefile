@@ -1,0 +1,93 @@
+# The front door: `make` alone lists what there is. Every target builds .venv first when it needs to.
+
+PYTHON ?= python3
+VENV := .venv
+QRL := $(VENV)/bin/qrl
+STAMP := $(VENV)/ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train evaluate tasks test smoke lint FORCE
+.SUFFIXES:
+MAKEFLAGS += --no-print-directory
+
+define HELP
+  make setup                         make .venv with the pinned dependencies
+  make tasks                         list the tasks that TASK may name
+  make train TASK=circle             train, and leave a run folder
+       SEED=0 SEEDS=1                  the first seed; how many to train side by side
+       OUT=runs/circle                 the run folder
+       RESUME=1                        go on where that run stopped
+       CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
+       ARGS="--steps 2e6"              any other flag of `qrl train`; `qrl train --help` lists them
+  make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
+  make test                          the tests (ARGS="-k vtrace": any flag of pytest)
+  make smoke                         every command end to end, on a CPU
+  make lint                          ruff and basedpyright
+
+TASK is a name or a path to a .json. `make setup PYTHON=python3.12` picks the interpreter.
+endef
+
+help:
+	$(info $(HELP))
+	@:
+
+# A shell word that stands for $1, whatever is in it; a flag $1 with the value $2 where there is one.
+quoted = '$(subst ','\'',$1)'
+flag = $(if $2,$1 $(call quoted,$2))
+# Stop with one line, before anything is built, where the goal $1 lacks what it needs; $3 is how to call it.
+need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
+
+# A run's config.json names its own task.
+$(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
+$(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
+
+train: $(STAMP)
+	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
+		$(call flag,--out,$(OUT)) $(if $(filter-out 0,$(RESUME)),--resume) $(call flag,--config,$(CONFIG)) $(ARGS)
+
+evaluate: $(STAMP)
+	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(ARGS)
+
+tasks: $(STAMP)
+	@exec $(QRL) tasks $(ARGS)
+
+test: $(STAMP)
+	@exec $(VENV)/bin/python -m pytest $(ARGS)
+
+smoke: $(STAMP)
+	@exec tests/smoke.sh
+
+lint: $(STAMP)
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/basedpyright
+
+setup: $(STAMP)
+	@echo '$(VENV) is ready'
+
+# ---- .venv -----------------------------------------------------------------------------------------------
+# The stamp is touched last, and `unfinished` lies in .venv while pip works: what an interrupted set-up left
+# is thrown away, not patched. So is a .venv that was moved here (its scripts name the place where it was
+# made) or whose interpreter is gone.
+
+here := test -x $(VENV)/bin/python && grep -qsF "$(CURDIR)/$(VENV)/" $(VENV)/bin
+whole := test ! -e $(VENV)/unfinished && $(here)/pip && $(VENV)/bin/python -c 'import pip' 2>/dev/null
+
+# What is wrong with $(PYTHON), in a line, or nothing.
+python_problem = $(shell $(PYTHON) -c 'import sys; from importlib import util; \
+	v = sys.version_info; \
+	v >= (3, 11) or sys.exit("$(PYTHON) is Python %d.%d, and qrl needs 3.11 or newer: make setup PYTHON=python3.12" % v[:2]); \
+	util.find_spec("ensurepip") or sys.exit("$(PYTHON) lacks the venv module: apt-get install python3-venv")' \
+	2>&1 | tail -n 1)
+stop_on = $(if $1,$(error $1))
+
+$(STAMP): requirements.lock pyproject.toml $(shell $(here)/qrl || echo FORCE)
+	$(call stop_on,$(python_problem))
+	@$(whole) || { echo 'making $(VENV) (once; a few minutes)'; $(PYTHON) -m venv --clear $(VENV); }
+	@touch $(VENV)/unfinished
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements.lock
+	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps -e .
+	@rm $(VENV)/unfinished
+	@touch $@
+
+FORCE:

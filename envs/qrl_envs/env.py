@@ -1,0 +1,197 @@
+"""Tasks as Brax environments.
+
+`state.pipeline_state` is a `Lane`: the lane's own task (physics, reward weights, start ranges, bounds) travels
+with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` offers `restart` (a
+fresh start that keeps the lane's task) and `evaluation`. An episode that ends early by leaving the bounds has
+`done = 1` and `info["truncated"] = 1`: whoever bootstraps should treat it as a truncation.
+"""
+
+import abc
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax.numpy as jnp
+from brax.envs.base import Env, State
+
+from qrl_envs import measures, pendulum, quadrotor, rewards
+from qrl_envs import task as tasks
+from qrl_envs.task import PendulumTask, QuadrotorTask, Task
+
+
+class Params(NamedTuple):
+    """The task of one lane as a pytree."""
+
+    physics: Any
+    reward: Any
+    start: Any
+    bounds: Any
+
+
+class Lane(NamedTuple):
+    """One lane's `pipeline_state`."""
+
+    x: Any
+    params: Params
+
+
+class Evaluation(NamedTuple):
+    """How a task is judged: fly `env` for `steps`, add up the first `return_steps` rewards, then `measure`."""
+
+    env: Env
+    steps: int
+    return_steps: int
+    measure: Callable[[chex.Array], dict[str, chex.Array]] | None  # observations [steps + 1, F] -> named scalars
+
+
+class TaskEnv(Env):
+    """A Brax environment made from a task; subclasses say what one world does."""
+
+    def __init__(self, task: Task, params: Params, observation_size: int, action_size: int) -> None:
+        self.task = task
+        self.params = params
+        self._sizes = observation_size, action_size
+
+    @property
+    def observation_size(self) -> int:
+        return self._sizes[0]
+
+    @property
+    def action_size(self) -> int:
+        return self._sizes[1]
+
+    @property
+    def backend(self) -> str:
+        return "qrl"
+
+    @property
+    def episode_steps(self) -> int:
+        return self.task.episode_steps
+
+    def reset(self, rng: chex.PRNGKey) -> State:
+        """A fresh start drawn with `rng` (a legacy or typed key)."""
+        return self._begin(self.params, rng)
+
+    def restart(self, state: State, rng: chex.PRNGKey) -> State:
+        """A fresh start that keeps the task carried by `state`."""
+        return self._begin(state.pipeline_state.params, rng)
+
+    def step(self, state: State, action: chex.Array) -> State:
+        """One control period under `action` in [−1, 1]ⁿ (values beyond are clipped)."""
+        lane: Lane = state.pipeline_state
+        x, reward = self._advance(lane.params, lane.x, action)
+        done = self._fled(lane.params, x).astype(jnp.float32)
+        return state.replace(
+            pipeline_state=Lane(x, lane.params),
+            obs=self._observe(x),
+            reward=reward,
+            done=done,
+            info={**state.info, "truncated": done},
+        )
+
+    def _begin(self, params: Params, rng: chex.PRNGKey) -> State:
+        x = self._draw(params, rng)
+        zero = jnp.float32(0.0)
+        return State(Lane(x, params), self._observe(x), zero, zero, metrics={}, info={"truncated": zero})
+
+    @abc.abstractmethod
+    def _draw(self, params: Params, rng: chex.PRNGKey) -> Any: ...
+
+    @abc.abstractmethod
+    def _advance(self, params: Params, x: Any, action: chex.Array) -> tuple[Any, chex.Array]: ...
+
+    @abc.abstractmethod
+    def _observe(self, x: Any) -> chex.Array: ...
+
+    def _fled(self, params: Params, x: Any) -> chex.Array:
+        """Whether the episode ends here, before its last step; a bool []."""
+        return jnp.bool_(False)
+
+    @abc.abstractmethod
+    def evaluation(self) -> Evaluation:
+        """How DESIGN.md judges this task, whatever ranges and weights it trains with."""
+
+
+class QuadrotorEnv(TaskEnv):
+    """Hover or circle. Observation [18] and action [4] as in DESIGN.md, "Frames, units, order"."""
+
+    task: QuadrotorTask
+
+    def __init__(self, task: QuadrotorTask) -> None:
+        bounds = {name: jnp.float32(value) for name, value in task.bounds.model_dump().items()}
+        reward = rewards.from_spec(task.reward)
+        params = Params(quadrotor.physics(task.vehicle), reward, quadrotor.start(task.start), bounds)
+        super().__init__(task, params, observation_size=18, action_size=4)
+
+    def _draw(self, params: Params, rng: chex.PRNGKey) -> quadrotor.Body:
+        return quadrotor.draw(params.start, rng)
+
+    def _advance(
+        self, params: Params, x: quadrotor.Body, action: chex.Array
+    ) -> tuple[quadrotor.Body, chex.Array]:
+        thrust = quadrotor.thrust_N(params.physics, action)
+        body = quadrotor.step(params.physics, x, thrust, self.task.control_period_s)
+        return body, params.reward(body, quadrotor.applied_action(params.physics, thrust))
+
+    def _observe(self, x: quadrotor.Body) -> chex.Array:
+        return quadrotor.observe(x)
+
+    def _fled(self, params: Params, x: quadrotor.Body) -> chex.Array:
+        near = jnp.linalg.norm(x.pose.position_m) <= params.bounds["distance_m"]
+        calm = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
+        return ~(near & calm)  # so that a NaN ends the episode too
+
+    def evaluation(self) -> Evaluation:
+        spec, dt_s = self.task.evaluation, self.task.control_period_s
+        env = QuadrotorEnv(self.task.model_copy(update={"start": spec.start, "reward": spec.reward}))
+
+        def measure(observations: chex.Array) -> dict[str, chex.Array]:
+            if spec.reward.form == "hover":
+                flight = measures.hover(observations, spec)
+            else:
+                flight = measures.circle(observations, spec, spec.reward.radius_m, spec.reward.speed_m_s)
+            return measures.summarise(flight, round(spec.tail_s / dt_s), dt_s)
+
+        return Evaluation(env, round(spec.duration_s / dt_s), self.task.episode_steps, measure)
+
+
+class PendulumEnv(TaskEnv):
+    """Pendulum-v1. Observation [cos θ, sin θ, θ̇], action [1]: torque/max_torque."""
+
+    task: PendulumTask
+
+    def __init__(self, task: PendulumTask) -> None:
+        params = Params(pendulum.physics(task.rod), rewards.from_spec(task.reward), pendulum.start(task.start), {})
+        super().__init__(task, params, observation_size=3, action_size=1)
+
+    def _draw(self, params: Params, rng: chex.PRNGKey) -> pendulum.Pendulum:
+        return pendulum.draw(params.start, rng)
+
+    def _advance(
+        self, params: Params, x: pendulum.Pendulum, action: chex.Array
+    ) -> tuple[pendulum.Pendulum, chex.Array]:
+        torque = pendulum.torque_N_m(params.physics, action)
+        return pendulum.step(params.physics, x, torque, self.task.control_period_s), params.reward(x, torque)
+
+    def _observe(self, x: pendulum.Pendulum) -> chex.Array:
+        return pendulum.observe(x)
+
+    def evaluation(self) -> Evaluation:
+        spec, dt_s = self.task.evaluation, self.task.control_period_s
+
+        def measure(observations: chex.Array) -> dict[str, chex.Array]:
+            return measures.summarise(measures.pendulum(observations, spec), round(spec.tail_s / dt_s), dt_s)
+
+        return Evaluation(self, round(spec.duration_s / dt_s), self.task.episode_steps, measure)
+
+
+def from_task(task: Task) -> TaskEnv:
+    """The Brax environment of a task."""
+    return QuadrotorEnv(task) if isinstance(task, QuadrotorTask) else PendulumEnv(task)
+
+
+def make(name_or_path: str) -> TaskEnv:
+    """The Brax environment of a shipped task's name or of a task file; BadInput if there is none."""
+    return from_task(tasks.load(name_or_path))
+
+

@@ -1,0 +1,33 @@
+"""Fixed-step integrators for second-order systems, apart from what they integrate.
+
+A state is a NamedTuple (pose, twist): a configuration and its rate, each any pytree. A derivative maps a
+state to a state of time derivatives; inputs and parameters are bound into it by the caller.
+"""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+
+X = TypeVar("X", bound=Any)  # a NamedTuple with the fields pose and twist
+
+
+def _advance(x: Any, x_dot: Any, dt_s: float) -> Any:
+    return jax.tree.map(lambda value, rate: value + dt_s * rate, x, x_dot)
+
+
+def semi_implicit_euler(
+    derivative: Callable[[X], X], x: X, dt_s: float, limit: Callable[[Any], Any] = lambda twist: twist
+) -> X:
+    """One step, first order: the twist first (then limited), then the pose with the new twist."""
+    twist = limit(_advance(x.twist, derivative(x).twist, dt_s))
+    return x._replace(pose=_advance(x.pose, derivative(x._replace(twist=twist)).pose, dt_s), twist=twist)
+
+
+def rk4(derivative: Callable[[X], X], x: X, dt_s: float) -> X:
+    """One step of the classical Runge–Kutta method, fourth order."""
+    k1 = derivative(x)
+    k2 = derivative(_advance(x, k1, dt_s / 2))
+    k3 = derivative(_advance(x, k2, dt_s / 2))
+    k4 = derivative(_advance(x, k3, dt_s))
+    return jax.tree.map(lambda v, a, b, c, d: v + dt_s / 6 * (a + 2 * b + 2 * c + d), x, k1, k2, k3, k4)

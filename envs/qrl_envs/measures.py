@@ -1,0 +1,62 @@
+"""How well a flight went: success, settle time, steady-state errors (DESIGN.md, "Evaluation").
+
+For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps. A comparison with a NaN
+is false, so a flight with a number that is not finite is never a success.
+"""
+
+from typing import NamedTuple
+
+import chex
+import jax.numpy as jnp
+
+from qrl_envs.task import FlightEvaluation, PendulumEvaluation
+
+
+class Errors(NamedTuple):
+    """Steady-state errors of one flight, by name, and where each sample is within the tolerances."""
+
+    within: chex.Array  # [K + 1] bool
+    errors: dict[str, chex.Array]  # name with unit -> [K + 1]
+
+
+def hover(observations: chex.Array, tolerance: FlightEvaluation) -> Errors:
+    """Distance from the hover point [m]."""
+    distance = jnp.linalg.norm(observations[:, 9:12], axis=-1)
+    return Errors(distance < tolerance.distance_m, {"position_m": distance})
+
+
+def circle(observations: chex.Array, tolerance: FlightEvaluation, radius_m: float, speed_m_s: float) -> Errors:
+    """Radius error r − radius, height z, tangential speed (x·vy − y·vx)/r minus the wanted one."""
+    x, y, z, vx, vy = (observations[:, i] for i in (9, 10, 11, 12, 13))
+    r = jnp.hypot(x, y)
+    speed = (x * vy - y * vx) / r - speed_m_s
+    assert tolerance.speed_m_s is not None  # the task file's validator saw to it
+    within = (jnp.hypot(r - radius_m, z) < tolerance.distance_m) & (jnp.abs(speed) < tolerance.speed_m_s)
+    return Errors(within, {"radius_m": r - radius_m, "height_m": z, "speed_m_s": speed})
+
+
+def pendulum(observations: chex.Array, tolerance: PendulumEvaluation) -> Errors:
+    """Angle from upright [rad] and rate [rad/s]."""
+    theta, rate = jnp.arctan2(observations[:, 1], observations[:, 0]), observations[:, 2]
+    within = (jnp.abs(theta) < tolerance.angle_rad) & (jnp.abs(rate) < tolerance.rate_rad_s)
+    return Errors(within, {"angle_rad": theta})
+
+
+def settle_s(within: chex.Array, dt_s: float) -> chex.Array:
+    """First time [s] from which `within` [K + 1] holds to the end; infinite where it does not; []."""
+    outside = ~within
+    last_outside = within.shape[0] - 1 - jnp.argmax(outside[::-1])
+    settled = jnp.where(jnp.any(outside), last_outside + 1, 0)
+    return jnp.where(within[-1], settled * dt_s, jnp.inf)
+
+
+def summarise(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Array]:
+    """{"success": 0 or 1, "settle_s", "rms_<error>"…} of one flight; the tail is its last `tail_steps` control periods."""
+    tail = {name: error[-(tail_steps + 1) :] for name, error in flight.errors.items()}
+    rms = {f"rms_{name}": jnp.sqrt(jnp.mean(error**2)) for name, error in tail.items()}
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(error)) for error in flight.errors.values()]))
+    return {
+        "success": (finite & jnp.all(flight.within[-(tail_steps + 1) :])).astype(jnp.float32),
+        "settle_s": jnp.where(finite, settle_s(flight.within, dt_s), jnp.inf),
+        **{name: jnp.where(jnp.isfinite(value), value, jnp.inf) for name, value in rms.items()},
+    }

@@ -1,0 +1,119 @@
+"""The paper's quadrotor: gravity and motor thrust only (Sec. 5).  For one vehicle; the caller vmaps.
+
+World and body frames: x forward, y left, z up. Quaternions [w, x, y, z], body -> world.
+"""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from qrl_envs import integrate, rotation
+from qrl_envs.task import STANDARD_GRAVITY_M_S2, FlightStart, Vehicle
+
+
+class Physics(NamedTuple):
+    """Parameters as arrays, so that they batch and differentiate."""
+
+    mass_kg: chex.Array  # []
+    inertia_kg_m2: chex.Array  # [3] principal, about body x, y, z
+    motor_position_m: chex.Array  # [4, 2] x, y in the body frame
+    motor_spin: chex.Array  # [4] +1: reaction torque positive about body z
+    motor_max_N: chex.Array  # [4]
+    yaw_moment_m: chex.Array  # [] reaction torque per thrust
+    action_scale_N: chex.Array  # []
+    gravity_m_s2: chex.Array  # []
+
+
+class Pose(NamedTuple):
+    position_m: chex.Array  # [3] world
+    attitude: chex.Array  # [4] quaternion body -> world
+
+
+class Twist(NamedTuple):
+    velocity_m_s: chex.Array  # [3] world
+    body_rate_rad_s: chex.Array  # [3] body
+
+
+class Body(NamedTuple):
+    pose: Pose
+    twist: Twist
+
+
+class Start(NamedTuple):
+    position_m: chex.Array
+    velocity_m_s: chex.Array
+    body_rate_rad_s: chex.Array
+
+
+def physics(vehicle: Vehicle) -> Physics:
+    return Physics(
+        mass_kg=jnp.float32(vehicle.mass_kg),
+        inertia_kg_m2=jnp.asarray(vehicle.inertia_kg_m2, jnp.float32),
+        motor_position_m=jnp.asarray([m.position_m for m in vehicle.motors], jnp.float32),
+        motor_spin=jnp.asarray([m.spin for m in vehicle.motors], jnp.float32),
+        motor_max_N=jnp.asarray([m.max_N for m in vehicle.motors], jnp.float32),
+        yaw_moment_m=jnp.float32(vehicle.yaw_moment_m),
+        action_scale_N=jnp.float32(vehicle.action_scale_N),
+        gravity_m_s2=jnp.float32(STANDARD_GRAVITY_M_S2),
+    )
+
+
+def start(ranges: FlightStart) -> Start:
+    return Start(*(jnp.float32(getattr(ranges, field)) for field in Start._fields))
+
+
+def hover_thrust_N(physics: Physics) -> chex.Array:
+    """F_o = mg/4, the offset force on each motor (paper, equ:forceOutput); []."""
+    return physics.mass_kg * physics.gravity_m_s2 / 4.0
+
+
+def thrust_N(physics: Physics, action: chex.Array) -> chex.Array:
+    """F = clip(F_o + action_scale·a, 0, max) of each motor, for an action clipped to [−1, 1]; [4] -> [4]."""
+    wanted = hover_thrust_N(physics) + physics.action_scale_N * jnp.clip(action, -1.0, 1.0)
+    return jnp.clip(wanted, 0.0, physics.motor_max_N)
+
+
+def applied_action(physics: Physics, thrust: chex.Array) -> chex.Array:
+    """a = (F − F_o)/action_scale of the thrust F that was applied; [4] -> [4]. What rewards see."""
+    return (thrust - hover_thrust_N(physics)) / physics.action_scale_N
+
+
+def derivative(physics: Physics, body: Body, thrust: chex.Array) -> Body:
+    """d(body)/dt under gravity and the motors' thrust [4] [N] along body z (Newton–Euler; gyroscopic term kept)."""
+    omega = body.twist.body_rate_rad_s
+    x, y = physics.motor_position_m[:, 0], physics.motor_position_m[:, 1]
+    torque = jnp.stack(
+        [jnp.sum(y * thrust), -jnp.sum(x * thrust), physics.yaw_moment_m * jnp.sum(physics.motor_spin * thrust)]
+    )
+    body_z = rotation.matrix(body.pose.attitude)[:, 2]
+    gravity = jnp.stack([jnp.zeros_like(physics.gravity_m_s2)] * 2 + [physics.gravity_m_s2])
+    return Body(
+        pose=Pose(body.twist.velocity_m_s, rotation.derivative(body.pose.attitude, omega)),
+        twist=Twist(
+            velocity_m_s=body_z * (jnp.sum(thrust) / physics.mass_kg) - gravity,
+            body_rate_rad_s=(torque - jnp.cross(omega, physics.inertia_kg_m2 * omega)) / physics.inertia_kg_m2,
+        ),
+    )
+
+
+def step(physics: Physics, body: Body, thrust: chex.Array, dt_s: float) -> Body:
+    """One control period under constant thrust [4] [N]: velocities first, then the pose with the new ones."""
+    body = integrate.semi_implicit_euler(lambda b: derivative(physics, b, thrust), body, dt_s)
+    return body._replace(pose=body.pose._replace(attitude=rotation.normalise(body.pose.attitude)))
+
+
+def observe(body: Body) -> chex.Array:
+    """[18]: rotation matrix body -> world row-major, position [m], velocity [m/s] (world), body rates [rad/s]."""
+    return jnp.concatenate([rotation.matrix(body.pose.attitude).reshape(9), body.pose.position_m, *body.twist])
+
+
+def draw(start: Start, key: chex.PRNGKey) -> Body:
+    """A fresh start: attitude uniform over SO(3), every other coordinate uniform within ± its range."""
+    attitude_key, key = jax.random.split(key)
+    position, velocity, rate = jax.random.uniform(key, (3, 3), minval=-1.0, maxval=1.0)
+    return Body(
+        Pose(start.position_m * position, rotation.uniform(attitude_key)),
+        Twist(start.velocity_m_s * velocity, start.body_rate_rad_s * rate),
+    )

@@ -1,0 +1,83 @@
+"""Rewards of the paper's form (Sec. 5) and Pendulum-v1's.  For one state; the caller vmaps."""
+
+from typing import NamedTuple
+
+import chex
+import jax.numpy as jnp
+
+from qrl_envs.pendulum import Pendulum
+from qrl_envs.quadrotor import Body
+from qrl_envs.task import CircleReward, HoverReward, PendulumReward
+
+
+class Hover(NamedTuple):
+    """Weights of the hover reward; scalars."""
+
+    constant: chex.Array
+    w1_attitude: chex.Array
+    w2_position_1_m: chex.Array
+    w3_action: chex.Array
+
+    def __call__(self, body: Body, action: chex.Array) -> chex.Array:
+        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) on the state after the step, with the action [4] as applied.
+
+        q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, one attitude, cost the same.
+        """
+        q = body.pose.attitude
+        q_e = jnp.concatenate([1.0 - jnp.abs(q[:1]), q[1:]])
+        p_e = body.pose.position_m
+        return self.constant - (
+            self.w1_attitude * jnp.linalg.norm(q_e)
+            + self.w2_position_1_m * jnp.linalg.norm(p_e)
+            + self.w3_action * jnp.linalg.norm(action)
+        )
+
+
+class Circle(NamedTuple):
+    """Weights of the circle reward and the circle itself (horizontal, about the origin); scalars."""
+
+    constant: chex.Array
+    w4_distance_1_m: chex.Array
+    w5_direction_s_m2: chex.Array
+    w6_action: chex.Array
+    radius_m: chex.Array
+    speed_m_s: chex.Array
+
+    def __call__(self, body: Body, action: chex.Array) -> chex.Array:
+        """constant − (w4·d + w5·|chi| + w6·‖a‖) on the state after the step, with the action [4] as applied.
+
+        d is the distance to the circle and chi = x·vy − y·vx − r_des·v_des (paper, Sec. 5.3).
+        """
+        x, y, z = body.pose.position_m
+        vx, vy, _ = body.twist.velocity_m_s
+        d = jnp.hypot(jnp.hypot(x, y) - self.radius_m, z)
+        chi = x * vy - y * vx - self.radius_m * self.speed_m_s
+        return self.constant - (
+            self.w4_distance_1_m * d
+            + self.w5_direction_s_m2 * jnp.abs(chi)
+            + self.w6_action * jnp.linalg.norm(action)
+        )
+
+
+class SwingUp(NamedTuple):
+    """Weights of Pendulum-v1's reward; scalars."""
+
+    w_angle_1_rad2: chex.Array
+    w_rate_s2_rad2: chex.Array
+    w_torque_1_N2m2: chex.Array
+
+    def __call__(self, x: Pendulum, torque: chex.Array) -> chex.Array:
+        """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²), θ wrapped to ±π, on the state before the step."""
+        theta = jnp.mod(x.pose + jnp.pi, 2.0 * jnp.pi) - jnp.pi
+        return -(
+            self.w_angle_1_rad2 * theta**2 + self.w_rate_s2_rad2 * x.twist**2 + self.w_torque_1_N2m2 * torque**2
+        )
+
+
+_FORMS = {"hover": Hover, "circle": Circle, "pendulum": SwingUp}
+
+
+def from_spec(spec: HoverReward | CircleReward | PendulumReward) -> Hover | Circle | SwingUp:
+    """The reward that a task file describes, its weights as arrays."""
+    kind = _FORMS[spec.form]
+    return kind(*(jnp.float32(getattr(spec, field)) for field in kind._fields))

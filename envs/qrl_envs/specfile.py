@@ -1,0 +1,130 @@
+"""Strict JSON specifications: one clear line for every way a file or flag can be wrong.
+
+The pydantic models of tasks and learner presets derive from `Spec`; `read` and `build` turn a file into one.
+"""
+
+import difflib
+import json
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+
+
+class BadInput(ValueError):
+    """The user's input is wrong. The message is one line: where, which key, what was expected."""
+
+
+class Spec(BaseModel):
+    """A frozen record read from JSON: no unknown keys, no coercion between types, only finite numbers."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+
+def _whole(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Count = Annotated[int, BeforeValidator(_whole), Field(ge=1)]  # accepts 2e6
+
+T = TypeVar("T")
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """' (did you mean …?)' with the known word nearest to `word`, or the list of them all."""
+    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(sorted(known))})"
+
+
+def read(path: Path) -> dict[str, Any]:
+    """The JSON object in the file at `path`; BadInput if unreadable, not JSON, not an object, or a key stands twice."""
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        keys = [key for key, _ in pairs]
+        for key in keys:
+            if keys.count(key) > 1:
+                raise BadInput(f"{path}: key '{key}' stands twice")
+        return dict(pairs)
+
+    def finite(token: str) -> float:
+        raise BadInput(f"{path}: {token} is not a number")
+
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique, parse_constant=finite)
+    except OSError as error:
+        raise BadInput(f"{path}: cannot be read ({error.strerror})") from None
+    except json.JSONDecodeError as error:
+        raise BadInput(f"{path}: line {error.lineno}, column {error.colno}: not JSON ({error.msg})") from None
+    except (UnicodeDecodeError, RecursionError):
+        raise BadInput(f"{path}: not JSON text") from None
+    if not isinstance(data, dict):
+        raise BadInput(f"{path}: expected a JSON object, found {type(data).__name__}")
+    return data
+
+
+def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
+    """`base` with the keys of `over` laid on top.
+
+    Objects merge key by key, but an object of another "form" replaces the old one; so does everything else.
+    """
+    merged = dict(base)
+    for key, value in over.items():
+        old = base.get(key)
+        both = isinstance(value, dict) and isinstance(old, dict)
+        merged[key] = merge(old, value) if both and value.get("form") in (None, old.get("form")) else value
+    return merged
+
+
+def build(kind: type[T] | Any, data: dict[str, Any], where: str) -> T:
+    """`data` as a value of the pydantic model (or annotated union) `kind`; BadInput names `where` and the key."""
+    adapter: TypeAdapter[T] = TypeAdapter(kind)
+    try:
+        return adapter.validate_json(json.dumps(data))
+    except ValidationError as error:
+        raise BadInput(f"{where}: {_first_line(error, kind)}") from None
+
+
+def _first_line(error: ValidationError, kind: Any) -> str:
+    # A misspelt key is the likelier cause than the key then missing, so it is named first.
+    problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    problem = problems[0]
+    model, path = _follow(kind, problem["loc"])
+    key = ".".join(path)
+    if problem["type"] == "extra_forbidden":
+        return f"unknown key '{key}'{nearest(path[-1], list(model.model_fields)) if model else ''}"
+    if problem["type"] == "missing":
+        return f"key '{key}' is missing"
+    message = problem["msg"].removeprefix("Value error, ")
+    expected = message[0].lower() + message[1:]
+    if not key:
+        return expected
+    found = json.dumps(problem["input"], default=str)
+    return f"key '{key}': {expected}, found {found if len(found) < 60 else found[:57] + '...'}"
+
+
+def _models(kind: Any) -> list[type[BaseModel]]:
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        return [kind]
+    return [model for part in get_args(kind) for model in _models(part)]
+
+
+def _follow(kind: Any, loc: tuple[int | str, ...]) -> tuple[type[BaseModel] | None, list[str]]:
+    """The innermost model that `loc` points into and the key's path as the user wrote it (union tags left out)."""
+    models, path, inner = _models(kind), [], None
+    for part in loc:
+        field = next((m for m in models if isinstance(part, str) and part in m.model_fields), None)
+        tagged = [m for m in models if _tag(m) == part]
+        if field is None and tagged and len(models) > 1:
+            models = tagged
+            continue
+        inner = field or (models[0] if isinstance(part, str) and models else inner)
+        path.append(str(part))
+        models = _models(field.model_fields[str(part)].annotation) if field else models
+    return inner, path
+
+
+def _tag(model: type[BaseModel]) -> Any:
+    return next((get_args(f.annotation)[0] for n, f in model.model_fields.items() if n in ("world", "form")), None)

@@ -1,0 +1,211 @@
+"""A task is data: what flies, how it starts, what is rewarded, when it ends and how it is judged.
+
+`load` reads a shipped task by name or a `.json` that may `extend` one. Units are in the names; frames are
+DESIGN.md's (world and body: x forward, y left, z up).
+"""
+
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, model_validator
+
+from qrl_envs import specfile
+from qrl_envs.specfile import BadInput, Count, NonNegative, Positive, Spec
+
+
+class Motor(Spec):
+    position_m: tuple[float, float]  # x, y in the body frame
+    spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about body z
+    max_N: Positive
+
+
+class Vehicle(Spec):
+    mass_kg: Positive
+    inertia_kg_m2: tuple[Positive, Positive, Positive]  # principal, about body x, y, z
+    motors: tuple[Motor, Motor, Motor, Motor]
+    yaw_moment_m: Positive  # reaction torque per thrust: N m per N
+    action_scale_N: Positive  # F_pi = action_scale_N · a
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Vehicle":
+        x, y, z = self.inertia_kg_m2
+        if 2 * max(x, y, z) > x + y + z:
+            raise ValueError(
+                f"expected inertia_kg_m2 of a rigid body: no moment above the sum of the other two, found {x}, {y}, {z}"
+            )
+        if self.total_thrust_N <= self.mass_kg * STANDARD_GRAVITY_M_S2:
+            raise ValueError(
+                f"expected motors that can lift the vehicle, found {self.total_thrust_N:.4g} N of thrust"
+                f" for {self.mass_kg * STANDARD_GRAVITY_M_S2:.4g} N of weight"
+            )
+        return self
+
+    @property
+    def total_thrust_N(self) -> float:
+        return sum(motor.max_N for motor in self.motors)
+
+
+STANDARD_GRAVITY_M_S2 = 9.81
+
+
+class FlightStart(Spec):
+    """Ranges of a uniform draw, each coordinate in ±range; the attitude is uniform over SO(3)."""
+
+    position_m: NonNegative  # from the hover point or the circle's centre
+    velocity_m_s: NonNegative
+    body_rate_rad_s: NonNegative
+
+
+class Bounds(Spec):
+    """Beyond these an episode ends early, as a truncation."""
+
+    distance_m: Positive
+    body_rate_rad_s: Positive
+
+
+class HoverReward(Spec):
+    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖), the paper's form."""
+
+    form: Literal["hover"]
+    constant: float = 0.0
+    w1_attitude: NonNegative
+    w2_position_1_m: NonNegative
+    w3_action: NonNegative
+
+
+class CircleReward(Spec):
+    """constant − (w4·d + w5·|chi| + w6·‖a‖), the paper's form."""
+
+    form: Literal["circle"]
+    constant: float = 0.0
+    w4_distance_1_m: NonNegative
+    w5_direction_s_m2: NonNegative
+    w6_action: NonNegative
+    radius_m: Positive
+    speed_m_s: Positive
+
+
+FlightReward = Annotated[HoverReward | CircleReward, Field(discriminator="form")]
+
+
+class FlightEvaluation(Spec):
+    """Success: every tolerance holds throughout the last `tail_s` of a flight of `duration_s`."""
+
+    duration_s: Positive
+    tail_s: Positive
+    distance_m: Positive  # from the hover point, or from the circle
+    speed_m_s: Positive | None = None  # circle only: |tangential speed − reward's speed|
+    start: FlightStart
+    reward: FlightReward  # what `return` adds up, over the first `episode_steps` of the flight
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "FlightEvaluation":
+        if self.tail_s > self.duration_s:
+            raise ValueError(f"expected tail_s of at most duration_s ({self.duration_s}), found {self.tail_s}")
+        if (self.speed_m_s is None) != (self.reward.form == "hover"):
+            raise ValueError("expected speed_m_s for the circle and for the circle alone")
+        return self
+
+
+class QuadrotorTask(Spec):
+    world: Literal["quadrotor"]
+    description: str
+    preset: str  # the learner's defaults for this task
+    control_period_s: Positive
+    episode_steps: Count
+    vehicle: Vehicle
+    start: FlightStart
+    bounds: Bounds
+    reward: FlightReward
+    evaluation: FlightEvaluation
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "QuadrotorTask":
+        if self.reward.form != self.evaluation.reward.form:
+            raise ValueError("expected reward.form and evaluation.reward.form to be the same")
+        return self
+
+
+class PendulumStart(Spec):
+    angle_rad: NonNegative
+    rate_rad_s: NonNegative
+
+
+class PendulumReward(Spec):
+    """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²), Gymnasium's form, on the state before the step."""
+
+    form: Literal["pendulum"]
+    w_angle_1_rad2: NonNegative
+    w_rate_s2_rad2: NonNegative
+    w_torque_1_N2m2: NonNegative
+
+
+class Rod(Spec):
+    mass_kg: Positive
+    length_m: Positive
+    gravity_m_s2: Positive
+    max_torque_N_m: Positive
+    max_rate_rad_s: Positive
+
+
+class PendulumEvaluation(Spec):
+    """Success: |θ| and |θ̇| within tolerance throughout the last `tail_s` of a flight of `duration_s`."""
+
+    duration_s: Positive
+    tail_s: Positive
+    angle_rad: Positive
+    rate_rad_s: Positive
+
+
+class PendulumTask(Spec):
+    world: Literal["pendulum"]
+    description: str
+    preset: str
+    control_period_s: Positive
+    episode_steps: Count
+    rod: Rod
+    start: PendulumStart
+    reward: PendulumReward
+    evaluation: PendulumEvaluation
+
+
+Task = QuadrotorTask | PendulumTask
+_ANY_TASK = Annotated[Task, Field(discriminator="world")]
+
+
+def shipped() -> list[str]:
+    """Names of the tasks that come with the package."""
+    return sorted(
+        entry.name.removesuffix(".json")
+        for entry in resources.files("qrl_envs").joinpath("tasks").iterdir()
+        if entry.name.endswith(".json")
+    )
+
+
+def _shipped(name: str) -> dict[str, Any]:
+    return extended(specfile.read(Path(str(resources.files("qrl_envs").joinpath("tasks", f"{name}.json")))), name)
+
+
+def load(name_or_path: str) -> Task:
+    """The task of a shipped name, or of a path to a `.json`; BadInput says in one line what is wrong."""
+    if name_or_path in shipped():
+        return specfile.build(_ANY_TASK, _shipped(name_or_path), name_or_path)
+    if name_or_path.endswith(".json"):
+        return from_data(specfile.read(Path(name_or_path)), name_or_path)
+    raise BadInput(f"unknown task '{name_or_path}'{specfile.nearest(name_or_path, shipped())}")
+
+
+def from_data(data: dict[str, Any], where: str) -> Task:
+    """The task of a JSON object that may `extend` a shipped task; `where` names its origin in errors."""
+    return specfile.build(_ANY_TASK, extended(data, where), where)
+
+
+def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
+    """`data` laid over the shipped task that its key `extend` names, if it names one."""
+    if "extend" not in data:
+        return data
+    base = data["extend"]
+    if base not in shipped():
+        raise BadInput(f"{where}: key 'extend': no shipped task '{base}'{specfile.nearest(str(base), shipped())}")
+    return specfile.merge(_shipped(base), {key: value for key, value in data.items() if key != "extend"})

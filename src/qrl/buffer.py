@@ -1,0 +1,41 @@
+"""Device-resident ring buffer of whole unrolls.
+
+A slot holds one unroll of all lanes; a full ring overwrites its oldest slot. `inserted` must stay unbatched
+where members are vmapped: a batched cursor turns the slice update into a scatter.
+"""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+
+
+class Ring(NamedTuple):
+    data: chex.ArrayTree  # leaves [slots, N, T, ...]
+    inserted: chex.Array  # int32 []: unrolls ever added
+
+
+def create(unroll: chex.ArrayTree, slots: int) -> Ring:
+    """An empty ring for unrolls like `unroll` (leaves [N, T, ...], arrays or shape structs)."""
+    return Ring(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), unroll), jnp.int32(0))
+
+
+def add(ring: Ring, unroll: chex.ArrayTree) -> Ring:
+    """Write `unroll` (leaves [N, T, ...]) into the next slot."""
+    slots = jax.tree.leaves(ring.data)[0].shape[0]
+    slot = ring.inserted % slots
+    data = jax.tree.map(
+        lambda d, x: jax.lax.dynamic_update_index_in_dim(d, x.astype(d.dtype), slot, 0), ring.data, unroll
+    )
+    return Ring(data, ring.inserted + 1)
+
+
+def sample(ring: Ring, key: chex.PRNGKey, trajectories: int) -> chex.ArrayTree:
+    """`trajectories` pairs (slot, lane) drawn uniformly, with replacement, from the filled slots; leaves [B, T, ...].
+
+    The ring must hold at least one unroll.
+    """
+    slots, lanes = jax.tree.leaves(ring.data)[0].shape[:2]
+    index = jax.random.randint(key, (trajectories,), 0, jnp.minimum(ring.inserted, slots) * lanes)
+    return jax.tree.map(lambda d: d.reshape(slots * lanes, *d.shape[2:])[index], ring.data)

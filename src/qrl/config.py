@@ -1,0 +1,89 @@
+"""The learner's hyperparameters: declared once here, valued in presets/*.json (paper's symbols, FIELD's terms)."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+
+def _whole(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+Count = Annotated[int, BeforeValidator(_whole), Field(ge=1)]  # accepts 2e6
+CountOrZero = Annotated[int, BeforeValidator(_whole), Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+
+
+class Config(BaseModel):
+    """Everything that the learner may be told. The defaults are src/qrl/presets/default.json."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    steps: Count = Field(description="environment steps in all")
+    episode_steps: Count | None = Field(description="longest training episode; null: the task's own")
+    lanes: Count = Field(description="environments stepped side by side")
+    unroll_steps: Count = Field(description="T: steps of one unroll, the trajectory length of Algorithm 2")
+    ring_unrolls: Count = Field(description="slots of the ring buffer, each one unroll of all lanes")
+    warmup_unrolls: Count = Field(description="unrolls collected before learning starts")
+    updates_per_unroll: Count = Field(description="minibatch updates after each unroll")
+    minibatch_lanes: Count = Field(description="trajectories (slot, lane) of one minibatch")
+
+    policy_hidden: tuple[Count, ...] = Field(description="hidden layers of the policy")
+    critic_hidden: tuple[Count, ...] = Field(description="hidden layers of the critic")
+    activation: Literal["relu", "tanh"] = Field(description="activation of both networks")
+    observation_scale: tuple[Positive, ...] | None = Field(
+        description="factor on each observation before the networks; null: 1"
+    )
+    normalise_observations: bool = Field(description="standardise observations by their running mean and deviation")
+    reward_scale: Positive = Field(description="factor on rewards, so that |V| is about 1")
+
+    learning_rate: Positive = Field(description="Adam's step size at the start")
+    learning_rate_end: NonNegative = Field(description="and at the end, linear in between")
+    gradient_clip: Positive = Field(description="global norm at which each network's gradient is clipped")
+    sigma: Positive = Field(description="the policy's standard deviation at the start")
+    sigma_end: Positive = Field(description="and at the end, log-linear in between")
+    average_fraction: Fraction = Field(
+        description="last part of the run over which the policy that ships is averaged; 0: not averaged"
+    )
+
+    gamma: Fraction = Field(description="discount")
+    lam: Fraction = Field(description="lambda of the trace; 1 in the paper")
+    rho_bar: Positive = Field(description="V-trace's clip of rho in the temporal difference; 1 in the paper")
+    c_bar: Positive = Field(description="V-trace's clip of rho in the trace; 1 in the paper")
+    advantage: Literal["pi", "mu"] = Field(
+        description="pi: A^pi by V-trace (conditions 3, 4); mu: A^mu by GAE(lambda) (conditions 1, 2)"
+    )
+    form: Literal["ratio", "difference"] = Field(
+        description="pi/mu − 1 (conditions 2, 4) or pi − mu (conditions 1, 3)"
+    )
+    epsilon: Positive = Field(description="margin epsilon·|A|")
+    xi: Positive | None = Field(description="constant margin in its stead; null: none")
+    normalise_advantage: bool = Field(description="divide A by its root mean square over the minibatch")
+
+    reports: Count = Field(description="reports, evaluations and checkpoints of a run")
+    report_flights: Count = Field(description="fixed starts flown at each report")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Config":
+        if self.warmup_unrolls > self.unrolls:
+            raise ValueError(
+                f"expected steps of at least warmup_unrolls · lanes · unroll_steps"
+                f" = {self.warmup_unrolls * self.unroll_size:,}, found {self.steps:,}"
+            )
+        return self
+
+    @property
+    def unroll_size(self) -> int:
+        """Environment steps in one unroll of all lanes."""
+        return self.lanes * self.unroll_steps
+
+    @property
+    def unrolls(self) -> int:
+        """Unrolls in the whole run; never more steps than `steps`."""
+        return self.steps // self.unroll_size
+
+    @property
+    def unrolls_per_report(self) -> int:
+        return max(1, -(-self.unrolls // self.reports))

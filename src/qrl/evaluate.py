@@ -1,0 +1,47 @@
+"""Deterministic flights from many starts, and what they measure."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env
+
+
+class Flights(NamedTuple):
+    """Leading axis: starts."""
+
+    returns: chex.Array  # [n] sum of the first `return_steps` rewards, up to the episode's end
+    measures: dict[str, chex.Array]  # name -> [n]; empty where the environment measures nothing
+    observations: chex.Array  # [n, steps + 1, F]; constant after the episode's end
+    actions: chex.Array  # [n, steps, A] clipped to [−1, 1]
+
+
+def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, longest: int) -> Flights:
+    """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
+
+    `env` is the training environment; one with an `evaluation` (ours) is flown and measured as that says,
+    another for one episode of `longest` steps. A flight that ends early stays where it ended.
+    """
+    plan = getattr(env, "evaluation", lambda: None)()
+    env, steps, return_steps, measure = plan or (env, longest, longest, None)
+
+    def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
+        state, total = carry
+        action = jnp.clip(mean(state.obs), -1.0, 1.0)
+        after = jax.vmap(env.step)(state, action)
+        over = state.done.astype(bool)
+        total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)
+        held = jax.tree.map(
+            lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state
+        )
+        return (held, total), (state.obs, action)
+
+    state = jax.vmap(env.reset)(keys)
+    (state, returns), (observations, actions) = jax.lax.scan(
+        step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps)
+    )
+    observations = jnp.concatenate([observations, state.obs[None]]).swapaxes(0, 1)
+    measures = jax.vmap(measure)(observations) if measure else {}
+    return Flights(returns, measures, observations, actions.swapaxes(0, 1))

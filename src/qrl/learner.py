@@ -1,0 +1,176 @@
+"""One minibatch update: V-trace or GAE, the perceptron objective, the value loss, Adam (Algorithm 1)."""
+
+import math
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from brax.training.acme import running_statistics as statistics
+
+from qrl.config import Config
+from qrl.networks import MLP, log_density
+from qrl.objective import perceptron
+from qrl.types import Networks, Transition
+from qrl.vtrace import vtrace
+
+
+class LearnerState(NamedTuple):
+    params: Networks
+    optimiser: Networks  # each network's own Adam
+    average: chex.ArrayTree  # policy parameters, averaged
+    statistics: statistics.RunningStatisticsState  # of observations; identity unless normalise_observations
+    updates: chex.Array  # int32 []
+
+
+class Terms(NamedTuple):
+    """What an update reports, in the order in which it computes them; scalars."""
+
+    log_rho: chex.Array
+    value: chex.Array
+    a_trace: chex.Array
+    policy_loss: chex.Array
+    value_loss: chex.Array
+    policy_gradient: chex.Array  # global norm before clipping
+    value_gradient: chex.Array
+
+
+class Learner:
+    """The learner's pure functions for one environment's sizes and one configuration; holds no state."""
+
+    def __init__(self, config: Config, observation_size: int, action_size: int) -> None:
+        self.config = config
+        self.observation_size = observation_size
+        self.policy = MLP(config.policy_hidden, action_size, config.activation, final_gain=0.01)
+        self.critic = MLP(config.critic_hidden, 1, config.activation, final_gain=1.0)
+        self.total_updates = max(1, (config.unrolls - config.warmup_unrolls + 1) * config.updates_per_unroll)
+        self._scale = jnp.asarray(config.observation_scale or (1.0,) * observation_size, jnp.float32)
+        # One flat vector for each network: far fewer, larger operations than leaf by leaf.
+        self._optimiser = optax.flatten(
+            optax.chain(optax.clip_by_global_norm(config.gradient_clip), optax.scale_by_adam())
+        )
+
+    def init(self, key: chex.PRNGKey) -> LearnerState:
+        policy_key, critic_key = jax.random.split(key)
+        observation = jnp.zeros(self.observation_size)
+        params = Networks(self.policy.init(policy_key, observation), self.critic.init(critic_key, observation))
+        return LearnerState(
+            params=params,
+            optimiser=Networks(self._optimiser.init(params.policy), self._optimiser.init(params.critic)),
+            average=params.policy,
+            statistics=statistics.init_state(jnp.zeros(self.observation_size)),
+            updates=jnp.int32(0),
+        )
+
+    def progress(self, state: LearnerState) -> chex.Array:
+        """Fraction of the run's updates already made."""
+        return state.updates / self.total_updates
+
+    def sigma(self, state: LearnerState) -> chex.Array:
+        """The policy's standard deviation, log-linear in the run's progress; []."""
+        start, end = math.log(self.config.sigma), math.log(self.config.sigma_end)
+        return jnp.exp(start + (end - start) * self.progress(state))
+
+    def scale(self, state: LearnerState, observation: chex.Array) -> chex.Array:
+        """Observations as the networks see them; [..., F] -> [..., F]."""
+        if self.config.normalise_observations:
+            observation = statistics.normalize(observation, state.statistics, max_abs_value=10.0)
+        return observation * self._scale
+
+    def mean(self, state: LearnerState, observation: chex.Array) -> chex.Array:
+        """The policy's mean action; [..., F] -> [..., A]."""
+        return self.policy.apply(state.params.policy, self.scale(state, observation))
+
+    def shipped(self, state: LearnerState) -> LearnerState:
+        """The learner with the policy that ships: the average, where averaging is on and has begun."""
+        if not self.config.average_fraction:
+            return state
+        begun = self._averaging(state) > 0
+        policy = jax.tree.map(lambda a, p: jnp.where(begun, a, p), state.average, state.params.policy)
+        return state._replace(params=state.params._replace(policy=policy))
+
+    def observe(self, state: LearnerState, observation: chex.Array) -> LearnerState:
+        """Take observations [..., F] into the running statistics, where they are used."""
+        if not self.config.normalise_observations:
+            return state
+        return state._replace(statistics=statistics.update(state.statistics, observation.reshape(-1, self.observation_size)))
+
+    def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
+        """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""
+        gradient, terms = jax.grad(self._loss, has_aux=True)(state.params, state, batch)
+        rate = self.config.learning_rate + self.progress(state) * (
+            self.config.learning_rate_end - self.config.learning_rate
+        )
+
+        def ascend(params: chex.ArrayTree, gradient: chex.ArrayTree, opt: chex.ArrayTree) -> tuple[chex.ArrayTree, ...]:
+            direction, opt = self._optimiser.update(gradient, opt)
+            return jax.tree.map(lambda p, d: p - rate * d, params, direction), opt
+
+        policy, policy_opt = ascend(state.params.policy, gradient.policy, state.optimiser.policy)
+        critic, critic_opt = ascend(state.params.critic, gradient.critic, state.optimiser.critic)
+        state = state._replace(
+            params=Networks(policy, critic), optimiser=Networks(policy_opt, critic_opt), updates=state.updates + 1
+        )
+        terms = terms._replace(
+            policy_gradient=optax.global_norm(gradient.policy), value_gradient=optax.global_norm(gradient.critic)
+        )
+        return self._averaged(state), terms
+
+    def _loss(self, params: Networks, state: LearnerState, batch: Transition) -> tuple[chex.Array, Terms]:
+        config = self.config
+        samples = batch.reward.shape
+
+        def flat(x: chex.Array) -> chex.Array:
+            return x.reshape(-1, x.shape[-1])  # one large product instead of a batched small one
+
+        observation = self.scale(state, flat(batch.observation))
+        next_observation = self.scale(state, flat(batch.next_observation))
+        value = self.critic.apply(params.critic, observation).reshape(samples)
+        next_value = jax.lax.stop_gradient(self.critic.apply(params.critic, next_observation)).reshape(samples)
+        mean = self.policy.apply(params.policy, observation)
+        log_pi = log_density(flat(batch.action), mean, self.sigma(state)).reshape(samples)
+        log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
+
+        # A^mu needs no correction for the difference between pi and mu; with rho = 1 the trace is GAE(lambda).
+        rho = jnp.exp(log_rho) if config.advantage == "pi" else jnp.ones_like(log_rho)
+        trace = jax.vmap(
+            lambda *trajectory: vtrace(
+                *trajectory, gamma=config.gamma, lam=config.lam, rho_bar=config.rho_bar, c_bar=config.c_bar
+            )
+        )(
+            config.reward_scale * batch.reward,
+            jax.lax.stop_gradient(value),
+            next_value,
+            batch.terminated,
+            batch.truncated,
+            rho,
+        )
+        a_trace = trace.a_trace
+        if config.normalise_advantage:
+            a_trace = a_trace / (jnp.sqrt(jnp.mean(a_trace**2)) + 1e-8)
+        policy_loss = -jnp.mean(
+            perceptron(log_pi, batch.log_mu, a_trace, form=config.form, epsilon=config.epsilon, xi=config.xi)
+        )
+        value_loss = jnp.mean((value - trace.v_trace) ** 2)
+        zero = jnp.zeros(())
+        return policy_loss + value_loss, Terms(
+            log_rho=jnp.mean(log_rho),
+            value=jnp.mean(value),
+            a_trace=jnp.sqrt(jnp.mean(trace.a_trace**2)),
+            policy_loss=policy_loss,
+            value_loss=value_loss,
+            policy_gradient=zero,
+            value_gradient=zero,
+        )
+
+    def _averaging(self, state: LearnerState) -> chex.Array:
+        """Updates since averaging began; ≤ 0 before."""
+        return state.updates - round(self.total_updates * (1.0 - self.config.average_fraction))
+
+    def _averaged(self, state: LearnerState) -> LearnerState:
+        if not self.config.average_fraction:
+            return state
+        weight = 1.0 / jnp.maximum(self._averaging(state), 1)
+        average = jax.tree.map(lambda a, p: a + weight * (p - a), state.average, state.params.policy)
+        return state._replace(average=average)

@@ -1,0 +1,160 @@
+"""The train loop: rollout -> ring -> updates, a whole report interval in one compiled program.
+
+Every value carries a leading member axis (one seed or grid point each). On a CPU members run one after the
+other inside the program (`lax.map`), which is faster there than batching small networks; elsewhere `vmap`.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env
+
+from qrl import buffer, evaluate, rollout
+from qrl.buffer import Ring
+from qrl.config import Config
+from qrl.learner import Learner, LearnerState, Terms
+from qrl.rollout import Lanes
+from qrl.types import Transition
+
+FAULT_TERMS = ("reward", "observation", *Terms._fields)
+
+
+class Totals(NamedTuple):
+    """Sums since the last report; scalars."""
+
+    rewards: chex.Array
+    steps: chex.Array
+    terminated: chex.Array  # episodes by how they ended
+    truncated: chex.Array
+    updates: chex.Array
+    terms: Terms
+
+
+class TrainState(NamedTuple):
+    """Everything a run needs to go on: what a checkpoint holds."""
+
+    learner: LearnerState
+    ring: Ring
+    lanes: Lanes
+    key: chex.PRNGKey
+    unrolls: chex.Array  # int32 []
+    fault_update: chex.Array  # int32 []: the update in which a number was first not finite; −1: none
+    fault_term: chex.Array  # int32 []: which (FAULT_TERMS)
+
+
+class Report(NamedTuple):
+    """One interval's outcome for each member."""
+
+    totals: Totals
+    returns: chex.Array  # [flights]
+    measures: dict[str, chex.Array]  # name -> [flights]
+
+
+class Trainer:
+    """The compiled programs of one environment and configuration."""
+
+    def __init__(self, env: Env, config: Config) -> None:
+        self.env = env
+        self.config = config
+        self.longest = rollout.episode_steps(env, config.episode_steps)
+        self.learner = Learner(config, int(env.observation_size), env.action_size)  # pyright: ignore[reportArgumentType]
+        self.init = jax.jit(lambda seeds: _over_members(self._init, seeds))
+        self.advance = jax.jit(
+            lambda states, until: _over_members(lambda state: self._advance(state, until), states), donate_argnums=0
+        )
+        self.evaluate = jax.jit(lambda learners, keys: _over_members(lambda one: self._evaluate(one, keys), learners))
+        self.fly = jax.jit(lambda learner, keys: self._fly(learner, keys))
+
+    def _init(self, seed: chex.Array) -> TrainState:
+        learner_key, lanes_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
+        lanes = rollout.begin(self.env, lanes_key, self.config.lanes, self.longest, self.config.unroll_steps)
+        learner = self.learner.init(learner_key)
+        _, transitions = jax.eval_shape(self._collect, learner, lanes, key)
+        ring = buffer.create(transitions, self.config.ring_unrolls)
+        return TrainState(learner, ring, lanes, key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1))
+
+    def _collect(self, learner: LearnerState, lanes: Lanes, key: chex.PRNGKey) -> tuple[Lanes, Transition]:
+        return rollout.unroll(
+            self.env,
+            lanes,
+            lambda observation: self.learner.mean(learner, observation),
+            self.learner.sigma(learner),
+            key,
+            unroll_steps=self.config.unroll_steps,
+            longest=self.longest,
+        )
+
+    def _advance(self, state: TrainState, until: chex.Array) -> tuple[TrainState, Totals]:
+        """Go on until `until` unrolls have been made."""
+
+        def one(_: int, carry: tuple[TrainState, Totals]) -> tuple[TrainState, Totals]:
+            return self._unroll_and_learn(*carry)
+
+        totals = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda s: self._unroll_and_learn(s, None)[1], state))
+        return jax.lax.fori_loop(state.unrolls, until, one, (state, totals))
+
+    def _unroll_and_learn(self, state: TrainState, totals: Totals | None) -> tuple[TrainState, Totals]:
+        collect_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
+        lanes, transitions = self._collect(state.learner, state.lanes, collect_key)
+        learner = self.learner.observe(state.learner, transitions.observation)
+        ring = buffer.add(state.ring, transitions)
+
+        def update(learner: LearnerState, key: chex.PRNGKey) -> tuple[LearnerState, Terms]:
+            return self.learner.update(learner, buffer.sample(ring, key, self.config.minibatch_lanes))
+
+        def learn(learner: LearnerState) -> tuple[LearnerState, Terms]:
+            return jax.lax.scan(update, learner, jax.random.split(learn_key, self.config.updates_per_unroll))
+
+        def wait(learner: LearnerState) -> tuple[LearnerState, Terms]:
+            zeros = jnp.zeros(self.config.updates_per_unroll)
+            return learner, Terms(*[zeros] * len(Terms._fields))
+
+        warm = state.unrolls + 1 >= self.config.warmup_unrolls
+        learned, terms = jax.lax.cond(warm, learn, wait, learner)
+        fault_update, fault_term = self._fault(transitions, terms, learner.updates)
+        fresh = (state.fault_update < 0) & (fault_update >= 0)
+        state = state._replace(
+            learner=learned,
+            ring=ring,
+            lanes=lanes,
+            unrolls=state.unrolls + 1,
+            fault_update=jnp.where(fresh, fault_update, state.fault_update),
+            fault_term=jnp.where(fresh, fault_term, state.fault_term),
+        )
+        seen = Totals(
+            rewards=jnp.sum(transitions.reward),
+            steps=jnp.float32(self.config.unroll_size),
+            terminated=jnp.sum(transitions.terminated),
+            truncated=jnp.sum(transitions.truncated),
+            updates=(learned.updates - learner.updates).astype(jnp.float32),
+            terms=jax.tree.map(jnp.sum, terms),
+        )
+        return state, seen if totals is None else jax.tree.map(jnp.add, totals, seen)
+
+    def _fault(self, seen: Transition, terms: Terms, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
+        """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are."""
+        collected = jnp.stack(
+            [jnp.all(jnp.isfinite(x)) for x in (seen.reward, seen.observation)]
+        )
+        finite = jnp.concatenate(
+            [jnp.tile(collected, (self.config.updates_per_unroll, 1)), jnp.isfinite(jnp.stack(terms, axis=1))], axis=1
+        )
+        first = jnp.argmin(finite.reshape(-1))
+        update, term = first // finite.shape[1], first % finite.shape[1]
+        ok = jnp.all(finite)
+        return jnp.where(ok, -1, updates + update), jnp.where(ok, -1, term)
+
+    def _fly(self, learner: LearnerState, keys: chex.PRNGKey) -> evaluate.Flights:
+        shipped = self.learner.shipped(learner)
+        return evaluate.fly(self.env, lambda observation: self.learner.mean(shipped, observation), keys, self.longest)
+
+    def _evaluate(self, learner: LearnerState, keys: chex.PRNGKey) -> tuple[chex.Array, dict[str, chex.Array]]:
+        flights = self._fly(learner, keys)
+        return flights.returns, flights.measures
+
+
+def _over_members(one: Callable[[Any], Any], members: Any) -> Any:
+    return jax.lax.map(one, members) if jax.default_backend() == "cpu" else jax.vmap(one)(members)
