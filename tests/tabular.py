@@ -4,12 +4,12 @@ Every function works on a stack of MDPs at once.  Shapes, with any leading batch
 transition [..., S, A, S], reward [..., S, A], start [..., S], gamma [...], policy [..., S, A].
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 class MDP(NamedTuple):

@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tabular
-from tabular import MDP, Array
 
+import tabular
 from qrl.objective import Form, dominance, perceptron
+from tabular import MDP, Array
 
 Whose = Literal["mu", "pi"]  # whose advantage: A^mu or A^pi
 FORMS: tuple[Form, ...] = ("difference", "ratio")
@@ -59,7 +59,8 @@ def weighted(rho: Array, term: Array) -> Array:
 def dominates(mdp: MDP, pi: Array, mu: Array, form: Form, whose: Whose) -> Array:
     """Whether a dominating inequality, as qrl writes it, holds at every (s, a) [batch]."""
     advantage = tabular.advantage(mdp, mu if whose == "mu" else pi)
-    return (np.asarray(dominance(np.log(pi), np.log(mu), advantage, form)) >= 0).all((-1, -2))
+    left_side = dominance(jnp.log(pi), jnp.log(mu), jnp.asarray(advantage), form)
+    return (np.asarray(left_side) >= 0).all((-1, -2))
 
 
 # Sec. 2.1 and 3.2: the return of one policy in terms of another

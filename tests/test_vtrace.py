@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from qrl.vtrace import Trace, vtrace
 
@@ -17,7 +16,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     import rlax
 
-Array = NDArray[np.floating]
+Array = np.ndarray
 
 T = 50
 GAMMA = 0.97
@@ -69,7 +68,7 @@ def on_policy(seed: int, end_rate: float = 0.15) -> Trajectory:
 
 
 def ours(steps: Trajectory, lam: float = 1.0, rho_bar: float = 1.0, c_bar: float = 1.0) -> Trace:
-    """qrl's V-trace at this file's gamma."""
+    """V-trace by qrl at this file's gamma."""
     return our_vtrace(*map(jnp.asarray, steps), gamma=GAMMA, lam=lam, rho_bar=rho_bar, c_bar=c_bar)
 
 
@@ -86,7 +85,7 @@ def episode_end(steps: Trajectory, start: int) -> int:
 
 
 def td_error(steps: Trajectory) -> Array:
-    """delta [T] = r + gamma·V(s') − V(s), with V(s') zero after a termination."""
+    """TD error [T], r + gamma·V(s') − V(s), with V(s') zero after a termination."""
     return steps.reward + GAMMA * np.where(steps.terminated, 0.0, steps.next_value) - steps.value
 
 
@@ -170,7 +169,7 @@ def test_on_policy_a_trace_is_rlax_gae(seed: int, lam: float) -> None:
 
 @each_seed
 def test_on_policy_v_trace_is_the_discounted_return(seed: int) -> None:
-    """lambda = 1, pi = mu: Monte Carlo return of the rest of the episode, bootstrapped where it did not terminate."""
+    """Monte Carlo return of the rest of the episode, with V(s') unless it terminates, at lambda = 1 and pi = mu."""
     steps = on_policy(seed)
     expected = []
     for t in range(T):
@@ -218,4 +217,4 @@ def test_dtype_is_kept(dtype: type[np.floating], x64: bool, flags: type[np.gener
     with jax.enable_x64(x64):
         for output, expected in zip(ours(cast), exact, strict=True):
             assert output.dtype == dtype
-            np.testing.assert_allclose(output, expected, atol=100 * np.finfo(dtype).eps)
+            np.testing.assert_allclose(output, expected, atol=100 * float(np.finfo(dtype).eps))

@@ -24,6 +24,7 @@ class Lanes(NamedTuple):
     ended: chex.Array  # [N] bool: the episode is over; the lane restarts before its next step
     fresh: State  # [N] each lane's next start
     used: chex.Array  # [N] bool: that start has been taken
+    early: chex.Array  # [N] int32: episodes that ended before their last step, ever
 
 
 def episode_steps(env: Env, configured: int | None) -> int:
@@ -36,7 +37,7 @@ def begin(env: Env, key: chex.PRNGKey, lanes: int, longest: int, unroll_steps: i
     state = jax.vmap(env.reset)(jax.random.split(key, lanes))
     steps = jnp.arange(lanes) * longest // lanes // unroll_steps * unroll_steps
     none = jnp.zeros(lanes, bool)
-    return Lanes(state, steps.astype(jnp.int32), none, state, ~none)
+    return Lanes(state, steps.astype(jnp.int32), none, state, ~none, jnp.zeros(lanes, jnp.int32))
 
 
 def _restart(env: Env, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
@@ -62,6 +63,7 @@ def _restart(env: Env, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
         ended=jnp.zeros_like(lanes.ended),
         fresh=fresh,
         used=used | lanes.ended,
+        early=lanes.early,
     )
 
 
@@ -105,7 +107,8 @@ def unroll(
             terminated=terminated.astype(jnp.float32),
             truncated=(ended & ~terminated).astype(jnp.float32),
         )
-        return lanes._replace(state=state, steps=steps, ended=ended), transition
+        early = lanes.early + (done & (steps < longest))
+        return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition
 
     lanes, transitions = jax.lax.scan(step, lanes, (noise, jax.random.split(key, unroll_steps)))
     return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)

@@ -27,8 +27,8 @@ class Totals(NamedTuple):
 
     rewards: chex.Array
     steps: chex.Array
-    terminated: chex.Array  # episodes by how they ended
-    truncated: chex.Array
+    episodes: chex.Array  # that ended
+    early: chex.Array  # of these, before their last step (fled, tumbled, or terminated)
     updates: chex.Array
     terms: Terms
 
@@ -45,14 +45,6 @@ class TrainState(NamedTuple):
     fault_term: chex.Array  # int32 []: which (FAULT_TERMS)
 
 
-class Report(NamedTuple):
-    """One interval's outcome for each member."""
-
-    totals: Totals
-    returns: chex.Array  # [flights]
-    measures: dict[str, chex.Array]  # name -> [flights]
-
-
 class Trainer:
     """The compiled programs of one environment and configuration."""
 
@@ -65,8 +57,7 @@ class Trainer:
         self.advance = jax.jit(
             lambda states, until: _over_members(lambda state: self._advance(state, until), states), donate_argnums=0
         )
-        self.evaluate = jax.jit(lambda learners, keys: _over_members(lambda one: self._evaluate(one, keys), learners))
-        self.fly = jax.jit(lambda learner, keys: self._fly(learner, keys))
+        self.fly = jax.jit(lambda learners, keys: _over_members(lambda learner: self._fly(learner, keys), learners))
 
     def _init(self, seed: chex.Array) -> TrainState:
         learner_key, lanes_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
@@ -116,7 +107,7 @@ class Trainer:
         learned, terms = jax.lax.cond(warm, learn, wait, learner)
         fault_update, fault_term = self._fault(transitions, terms, learner.updates)
         fresh = (state.fault_update < 0) & (fault_update >= 0)
-        state = state._replace(
+        after = state._replace(
             learner=learned,
             ring=ring,
             lanes=lanes,
@@ -127,12 +118,12 @@ class Trainer:
         seen = Totals(
             rewards=jnp.sum(transitions.reward),
             steps=jnp.float32(self.config.unroll_size),
-            terminated=jnp.sum(transitions.terminated),
-            truncated=jnp.sum(transitions.truncated),
+            episodes=jnp.sum(transitions.terminated + transitions.truncated),
+            early=jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32),
             updates=(learned.updates - learner.updates).astype(jnp.float32),
             terms=jax.tree.map(jnp.sum, terms),
         )
-        return state, seen if totals is None else jax.tree.map(jnp.add, totals, seen)
+        return after, seen if totals is None else jax.tree.map(jnp.add, totals, seen)
 
     def _fault(self, seen: Transition, terms: Terms, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
         """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are."""
@@ -150,10 +141,6 @@ class Trainer:
     def _fly(self, learner: LearnerState, keys: chex.PRNGKey) -> evaluate.Flights:
         shipped = self.learner.shipped(learner)
         return evaluate.fly(self.env, lambda observation: self.learner.mean(shipped, observation), keys, self.longest)
-
-    def _evaluate(self, learner: LearnerState, keys: chex.PRNGKey) -> tuple[chex.Array, dict[str, chex.Array]]:
-        flights = self._fly(learner, keys)
-        return flights.returns, flights.measures
 
 
 def _over_members(one: Callable[[Any], Any], members: Any) -> Any:

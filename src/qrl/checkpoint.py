@@ -1,0 +1,37 @@
+"""Orbax checkpoints of the whole training state, one manager for each member's folder."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+KEEP = 5
+
+
+def manager(folder: Path) -> ocp.CheckpointManager:
+    """The checkpoints of a run folder; a half-written one is not among them."""
+    return ocp.CheckpointManager(
+        (folder / "checkpoints").resolve(),
+        options=ocp.CheckpointManagerOptions(max_to_keep=KEEP, enable_async_checkpointing=False),
+    )
+
+
+def member(states: Any, index: int) -> Any:
+    """One member's state as NumPy copies: a live view of a device array would silently cancel its donation."""
+    return jax.tree.map(lambda x: np.array(x[index]), states)
+
+
+def save(checkpoints: ocp.CheckpointManager, env_steps: int, state: Any) -> None:
+    checkpoints.save(env_steps, args=ocp.args.StandardSave(state))
+
+
+def restore(checkpoints: ocp.CheckpointManager, env_steps: int, like: Any) -> Any:
+    """The state saved at `env_steps`; `like` gives structure, shapes and types (one member's)."""
+    return checkpoints.restore(env_steps, args=ocp.args.StandardRestore(like))
+
+
+def stack(states: list[Any]) -> Any:
+    """Members' states side by side again."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)

@@ -1,0 +1,109 @@
+"""The run folder: what was asked (config.json), what happened (metrics.csv, TensorBoard), what came out (summary.json)."""
+
+import csv
+import json
+import math
+import os
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from qrl.config import Config, CountOrZero
+
+FORMAT = 1
+_PACKAGES = ("qrl", "jax", "jaxlib", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class TaskRecord(BaseModel):
+    """The task's name as the user gave it and, for our own worlds, everything that the task file said."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    spec: dict[str, Any] | None  # null: one of Brax's own environments
+
+
+class RunConfig(BaseModel):
+    """config.json: alone enough to repeat the run."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: int = FORMAT
+    task: TaskRecord
+    learner: Config
+    seed: CountOrZero
+    seeds: int = Field(ge=1)
+    versions: dict[str, str] = {}
+    devices: list[str] = []
+
+    def member(self, index: int) -> "RunConfig":
+        """The config of one of the seeds trained side by side."""
+        return self.model_copy(update={"seed": self.seed + index, "seeds": 1})
+
+
+def versions() -> dict[str, str]:
+    return {name: metadata.version(name) for name in _PACKAGES}
+
+
+def preset(name: str) -> dict[str, Any]:
+    """The learner's defaults laid under the preset `name` ("default" for a task without one of its own)."""
+    folder = resources.files("qrl").joinpath("presets")
+    data = json.loads(folder.joinpath("default.json").read_text(encoding="utf-8"))
+    if name != "default":
+        data |= json.loads(folder.joinpath(f"{name}.json").read_text(encoding="utf-8"))
+    return data
+
+
+def presets() -> list[str]:
+    folder = resources.files("qrl").joinpath("presets")
+    return sorted(entry.name.removesuffix(".json") for entry in folder.iterdir() if entry.name.endswith(".json"))
+
+
+def members(out: Path, run: RunConfig) -> list[Path]:
+    """The folder of each seed: `out` itself, or out/seed-K for several."""
+    return [out] if run.seeds == 1 else [out / f"seed-{run.seed + i}" for i in range(run.seeds)]
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write `data` whole or not at all."""
+    temporary = path.with_name(path.name + ".tmp")
+    temporary.write_text(json.dumps(_plain(data), indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _plain(data: Any) -> Any:
+    """JSON has no infinities: a number that is not finite becomes null."""
+    if isinstance(data, dict):
+        return {key: _plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_plain(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
+
+
+Row = dict[str, float | int]
+
+
+def read_metrics(folder: Path) -> list[Row]:
+    """The rows of metrics.csv; empty cells (not measured) are left out."""
+    path = folder / "metrics.csv"
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return [
+            {key: float(cell) if "." in cell or "n" in cell or "e" in cell else int(cell) for key, cell in row.items() if cell}
+            for row in csv.DictReader(file)
+        ]
+
+
+def write_metrics(folder: Path, rows: list[Row]) -> None:
+    """Write metrics.csv anew: a few dozen rows, and so it is never half-written."""
+    temporary = folder / "metrics.csv.tmp"
+    with temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
+        writer.writeheader()
+        writer.writerows(
+            {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()} for row in rows
+        )
+    os.replace(temporary, folder / "metrics.csv")
