@@ -83,7 +83,7 @@ stop_on = $(if $1,$(error $1))
 
 $(STAMP): requirements.lock pyproject.toml $(shell $(here)/qrl || echo FORCE)
 	$(call stop_on,$(python_problem))
-	@$(whole) || { echo 'making $(VENV) (once; a few minutes)'; $(PYTHON) -m venv --clear $(VENV); }
+	@$(whole) || { echo 'making $(VENV) (once; a few minutes)'; rm -rf $(VENV)/bin && $(PYTHON) -m venv --clear $(VENV); }
 	@touch $(VENV)/unfinished
 	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements.lock
 	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps -e .

@@ -130,7 +130,7 @@ done
 kill -INT "$pid" 2>/dev/null || true
 code=0
 wait "$pid" || code=$?
-((code == 0 || code == 130)) || fail "Ctrl-C: exit code $code"
+((code == 0 || code == 1)) || fail "Ctrl-C: exit code $code"
 ! grep -q Traceback "$work/stderr" || fail "Ctrl-C: a traceback"
 
 passes "resume it" make train TASK=circle OUT="$out/circle" RESUME=1 ARGS="$long"

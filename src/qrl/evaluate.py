@@ -6,6 +6,7 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env
 
 
@@ -45,3 +46,19 @@ def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, 
     observations = jnp.concatenate([observations, state.obs[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
     return Flights(returns, measures, observations, actions.swapaxes(0, 1))
+
+
+def summarise(flights: Flights) -> dict[str, float]:
+    """What a report says of flights from n starts: mean and least return and, where measured, success (a
+    fraction), settle time (median and p95 over starts, infinite where too few settle) and each steady-state
+    error (the median over starts of each start's RMS).
+    """
+    returns = np.asarray(flights.returns)
+    summary = {"return_mean": float(returns.mean()), "return_min": float(returns.min()), "success": float("nan")}
+    measures = {name: np.asarray(value) for name, value in flights.measures.items()}
+    if measures:
+        settle = np.sort(measures["settle_s"])
+        summary["success"] = float(measures["success"].mean())
+        summary["settle_median_s"] = float(settle[(len(settle) - 1) // 2])
+        summary["settle_p95_s"] = float(settle[-(-95 * (len(settle) - 1) // 100)])
+    return summary | {name: float(np.median(v)) for name, v in measures.items() if name.startswith("rms_")}

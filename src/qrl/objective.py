@@ -10,6 +10,9 @@ import jax.numpy as jnp
 
 Form = Literal["ratio", "difference"]
 
+# exp overflows float32 at 88; 0·inf would then make the gradient of a clipped sample NaN instead of 0.
+MAX_LOG_RATIO = 20.0
+
 
 def dominance(log_pi: chex.Array, log_mu: chex.Array, advantage: chex.Array, form: Form) -> chex.Array:
     """Left-hand side of a dominating inequality; pi improves on mu where it is ≥ 0 at every (s, a).
@@ -18,11 +21,12 @@ def dominance(log_pi: chex.Array, log_mu: chex.Array, advantage: chex.Array, for
     form "difference":  (pi − mu)·A     conditions 1 and 3
 
     `advantage` is A^mu (conditions 1 and 2) or A^pi (3 and 4). All arrays have one shape [...];
-    `log_pi` and `log_mu` are log-probabilities (or log-densities) of the action that was taken.
+    `log_pi` and `log_mu` are log-probabilities (or log-densities) of the action that was taken. Nothing here
+    stops gradients: whoever holds the advantage constant says so.
     """
     chex.assert_equal_shape((log_pi, log_mu, advantage))
     if form == "ratio":
-        return jnp.expm1(log_pi - log_mu) * advantage
+        return jnp.expm1(jnp.minimum(log_pi - log_mu, MAX_LOG_RATIO)) * advantage
     return (jnp.exp(log_pi) - jnp.exp(log_mu)) * advantage
 
 

@@ -6,13 +6,13 @@ import math
 import os
 from importlib import metadata, resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict
 
-from qrl.config import Config, CountOrZero
+from qrl.config import Config, Count, CountOrZero
 
-FORMAT = 1
+FORMAT: Literal[1] = 1
 _PACKAGES = ("qrl", "jax", "jaxlib", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -25,18 +25,32 @@ class TaskRecord(BaseModel):
     spec: dict[str, Any] | None  # null: one of Brax's own environments
 
 
+class ConfigFile(BaseModel):
+    """What CONFIG= may hold: a run's config.json, or any part of one. Versions and devices are for the reader."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Literal[1] = FORMAT
+    task: str | TaskRecord | None = None
+    learner: dict[str, Any] = {}
+    seed: CountOrZero | None = None
+    seeds: Count | None = None
+    versions: dict[str, str] = {}
+    devices: list[str] = []
+
+
 class RunConfig(BaseModel):
     """config.json: alone enough to repeat the run."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    format: int = FORMAT
+    format: Literal[1] = FORMAT
     task: TaskRecord
     learner: Config
     seed: CountOrZero
-    seeds: int = Field(ge=1)
-    versions: dict[str, str] = {}
-    devices: list[str] = []
+    seeds: Count
+    versions: dict[str, str]
+    devices: list[str]
 
     def member(self, index: int) -> "RunConfig":
         """The config of one of the seeds trained side by side."""

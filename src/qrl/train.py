@@ -43,6 +43,7 @@ class TrainState(NamedTuple):
     unrolls: chex.Array  # int32 []
     fault_update: chex.Array  # int32 []: the update in which a number was first not finite; −1: none
     fault_term: chex.Array  # int32 []: which (FAULT_TERMS)
+    totals: Totals  # since the last report; whoever reports sets them to zero
 
 
 class Trainer:
@@ -65,7 +66,9 @@ class Trainer:
         learner = self.learner.init(learner_key)
         _, transitions = jax.eval_shape(self._collect, learner, lanes, key)
         ring = buffer.create(transitions, self.config.ring_unrolls)
-        return TrainState(learner, ring, lanes, key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1))
+        zero = jnp.float32(0.0)
+        totals = Totals(zero, zero, zero, zero, zero, Terms(*[zero] * len(Terms._fields)))
+        return TrainState(learner, ring, lanes, key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
 
     def _collect(self, learner: LearnerState, lanes: Lanes, key: chex.PRNGKey) -> tuple[Lanes, Transition]:
         return rollout.unroll(
@@ -78,16 +81,11 @@ class Trainer:
             longest=self.longest,
         )
 
-    def _advance(self, state: TrainState, until: chex.Array) -> tuple[TrainState, Totals]:
-        """Go on until `until` unrolls have been made."""
+    def _advance(self, state: TrainState, until: chex.Array) -> TrainState:
+        """Go on until `until` unrolls have been made; where it pauses on the way changes nothing."""
+        return jax.lax.fori_loop(state.unrolls, until, lambda _, state: self._unroll_and_learn(state), state)
 
-        def one(_: int, carry: tuple[TrainState, Totals]) -> tuple[TrainState, Totals]:
-            return self._unroll_and_learn(*carry)
-
-        totals = jax.tree.map(jnp.zeros_like, jax.eval_shape(lambda s: self._unroll_and_learn(s, None)[1], state))
-        return jax.lax.fori_loop(state.unrolls, until, one, (state, totals))
-
-    def _unroll_and_learn(self, state: TrainState, totals: Totals | None) -> tuple[TrainState, Totals]:
+    def _unroll_and_learn(self, state: TrainState) -> TrainState:
         collect_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
         lanes, transitions = self._collect(state.learner, state.lanes, collect_key)
         learner = self.learner.observe(state.learner, transitions.observation)
@@ -107,14 +105,6 @@ class Trainer:
         learned, terms = jax.lax.cond(warm, learn, wait, learner)
         fault_update, fault_term = self._fault(transitions, terms, learner.updates)
         fresh = (state.fault_update < 0) & (fault_update >= 0)
-        after = state._replace(
-            learner=learned,
-            ring=ring,
-            lanes=lanes,
-            unrolls=state.unrolls + 1,
-            fault_update=jnp.where(fresh, fault_update, state.fault_update),
-            fault_term=jnp.where(fresh, fault_term, state.fault_term),
-        )
         seen = Totals(
             rewards=jnp.sum(transitions.reward),
             steps=jnp.float32(self.config.unroll_size),
@@ -123,7 +113,16 @@ class Trainer:
             updates=(learned.updates - learner.updates).astype(jnp.float32),
             terms=jax.tree.map(jnp.sum, terms),
         )
-        return after, seen if totals is None else jax.tree.map(jnp.add, totals, seen)
+        return TrainState(
+            learner=learned,
+            ring=ring,
+            lanes=lanes,
+            key=state.key,
+            unrolls=state.unrolls + 1,
+            fault_update=jnp.where(fresh, fault_update, state.fault_update),
+            fault_term=jnp.where(fresh, fault_term, state.fault_term),
+            totals=jax.tree.map(jnp.add, state.totals, seen),
+        )
 
     def _fault(self, seen: Transition, terms: Terms, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
         """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are."""

@@ -1,0 +1,99 @@
+"""The command line's first second: parse, say what begins, import the rest (`commands`), map errors to exit codes."""
+
+import argparse
+import contextlib
+import difflib
+import io
+import os
+import sys
+import warnings
+from pathlib import Path
+from typing import NoReturn
+
+from qrl.config import Config
+
+DONE, FAILED, WRONG_INPUT = 0, 1, 2
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with one-line errors."""
+
+    def error(self, message: str) -> NoReturn:
+        unknown = message.removeprefix("unrecognized arguments: ").split()[0].split("=")[0]
+        if message.startswith("unrecognized arguments: --"):
+            flags = [flag for action in self._actions for flag in action.option_strings]
+            close = difflib.get_close_matches(unknown, flags, n=1)
+            message = f"unknown flag {unknown} " + (f"(did you mean {close[0]}?)" if close else f"(see {self.prog} --help)")
+        complain(message)
+        sys.exit(WRONG_INPUT)
+
+
+def complain(message: str) -> None:
+    """One line on stderr."""
+    print(f"qrl: {' '.join(message.split())}", file=sys.stderr)
+
+
+def whole_number(text: str) -> int:
+    value = float(text)
+    if not (value >= 0 and value.is_integer()):
+        raise ValueError
+    return int(value)
+
+
+def count(text: str) -> int:
+    value = whole_number(text)
+    if value < 1:
+        raise ValueError
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="qrl", description="From a vehicle and a task to a policy that flies.", allow_abbrev=False)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    train = commands.add_parser("train", help="train a policy; leaves a run folder", allow_abbrev=False)
+    train.add_argument("task", nargs="?", help="a task's name (see qrl tasks) or a .json file", metavar="TASK")
+    train.add_argument("--seed", type=whole_number, help="first seed (0)", metavar="N")
+    train.add_argument("--seeds", type=count, help="seeds trained side by side in one program (1)", metavar="N")
+    train.add_argument("--out", type=Path, help="run folder (runs/TASK)", metavar="FOLDER")
+    train.add_argument("--config", type=Path, help="a config.json, whole or in part", metavar="FILE")
+    train.add_argument("--resume", action="store_true", help="go on from the run folder's last checkpoint")
+    learner = train.add_argument_group("learner", "each as in the presets; the default is the task's preset")
+    for name, field in Config.model_fields.items():
+        text = (field.description or "").replace("%", "%%")
+        learner.add_argument(f"--{name.replace('_', '-')}", dest=f"learner.{name}", help=text, metavar="X")
+
+    evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts", allow_abbrev=False)
+    evaluate.add_argument("run", type=Path, help="run folder", metavar="RUN")
+    evaluate.add_argument("--starts", type=count, default=1000, help="how many starts (1000)", metavar="N")
+
+    commands.add_parser("tasks", help="list the tasks that can be trained", allow_abbrev=False)
+    return parser
+
+
+def _load() -> None:
+    """Import JAX and Brax (seconds on a cold disk), Brax's remarks kept off the screen; use the compile cache."""
+    warnings.filterwarnings("ignore", module=r"brax\..*")
+    with contextlib.redirect_stdout(io.StringIO()):  # Brax prints which optional packages it does not find
+        import jax
+
+        import qrl_envs  # noqa: F401  registers our tasks with Brax
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "qrl" / "xla"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns DESIGN.md's exit code: 0 done, 1 failed while running, 2 the input was wrong."""
+    args = _parser().parse_args(argv)
+    if args.command == "train":
+        print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
+    try:
+        _load()
+        from qrl import commands
+    except KeyboardInterrupt:
+        complain("interrupted")
+        return FAILED
+    return commands.run(args)

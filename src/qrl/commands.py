@@ -1,0 +1,251 @@
+"""The commands behind the command line: train, evaluate, tasks."""
+
+import argparse
+import json
+import signal
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
+from qrl import loop, plots, request, runs
+from qrl.cli import DONE, FAILED, WRONG_INPUT, complain
+from qrl.evaluate import Flights, summarise
+from qrl.runs import Row, RunConfig
+from qrl_envs import picture
+from qrl_envs import task as tasks
+from qrl_envs.specfile import BadInput
+
+EVALUATION_STARTS_SEED = 1_000_003  # other starts than the reports'
+PICTURE_FLIGHTS = 5
+
+console = Console(highlight=False, soft_wrap=True)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the parsed command and map what goes wrong to one line and an exit code."""
+    try:
+        return {"train": train, "evaluate": evaluate, "tasks": list_tasks}[args.command](args)
+    except BadInput as error:
+        complain(str(error))
+        return WRONG_INPUT
+    except loop.NotFinite as error:
+        complain(str(error))
+        return FAILED
+    except OSError as error:
+        complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return FAILED
+    except KeyboardInterrupt:
+        complain("interrupted")
+        return FAILED
+
+
+def list_tasks(_: argparse.Namespace) -> int:
+    for name in tasks.shipped():
+        console.print(f"{name:<10} {tasks.load(name).description}")
+    console.print(f"\nBrax's own: {', '.join(request.foreign_tasks())}")
+    console.print("Your own: a .json file that extends one of the first, such as experiments/vehicles/crazyflie.json")
+    return DONE
+
+
+# -- train ---------------------------------------------------------------------------------------------------
+
+
+def train(args: argparse.Namespace) -> int:
+    begun = time.perf_counter()
+    flags = _flags(args)
+    config = request.run_config(args.task, args.config, flags, args.seed, args.seeds)
+    out: Path = args.out or Path("runs") / config.task.name
+    held = (out / "config.json").exists()
+    if held and not args.resume:
+        raise BadInput(f"{out}: holds a run already; give another OUT, or RESUME=1 to go on with it")
+    if held:
+        given = flags | (config.learner.model_dump() if args.config else {})
+        config = request.resumed(out, config, given, args.seed, args.seeds)
+        if loop.finished(out, config):
+            console.print(f"{out}: finished already; nothing to do")
+            return DONE
+    env = request.environment(config.task)
+    request.check(env, config.learner)
+    _prepare(out, config, held)
+    console.print(
+        f"{config.task.name}: {config.learner.steps:,} steps, "
+        f"{'seed' if config.seeds == 1 else f'{config.seeds} seeds from'} {config.seed}, on {jax.devices()[0].platform} -> {out}"
+    )
+    with _stop_requested() as stopped:
+        flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
+        if stopped():
+            console.print(f"stopped, all saved; to go on: make train TASK={args.task or ''} OUT={out} RESUME=1")
+            return FAILED
+    _finish(out, config, flights, time.perf_counter() - begun)
+    return DONE
+
+
+def _flags(args: argparse.Namespace) -> dict[str, Any]:
+    """The learner's flags that were given, each read as JSON where it is JSON, else as text."""
+    given: dict[str, Any] = {}
+    for name, text in vars(args).items():
+        if name.startswith("learner.") and text is not None:
+            try:
+                given[name.removeprefix("learner.")] = json.loads(text)
+            except json.JSONDecodeError:
+                given[name.removeprefix("learner.")] = text
+    return given
+
+
+def _prepare(out: Path, config: RunConfig, held: bool) -> None:
+    for i, folder in enumerate(runs.members(out, config)):
+        folder.mkdir(parents=True, exist_ok=True)
+        if not held:
+            runs.write_json(folder / "config.json", config.member(i).model_dump(mode="json"))
+    if not held:
+        runs.write_json(out / "config.json", config.model_dump(mode="json"))
+
+
+@contextmanager
+def _stop_requested() -> Iterator[Callable[[], bool]]:
+    """Whether Ctrl-C (or SIGTERM) came; a second Ctrl-C interrupts at once."""
+    asked = False
+
+    def ask(number: int, _: Any) -> None:
+        nonlocal asked
+        if asked and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        asked = True
+        console.print("stopping: saving first")
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
+    """Show what happens, a line a report; returns the last report's flights."""
+    flights, started = None, time.perf_counter()
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=config.learner.unrolls * config.learner.unroll_size, note="")
+        compiling = ""
+        for event in events:
+            if compiling and not isinstance(event, loop.Compiling):
+                console.print(_HEADER)
+                compiling = ""
+            if isinstance(event, loop.Compiling):
+                compiling = event.what
+                console.print(f"compiling {event.what} ({time.perf_counter() - started:.1f} s)")
+            elif isinstance(event, loop.Progress):
+                note = f"{event.steps_per_second:,.0f} steps/s, {_clock(event.seconds_left)} left"
+                bar.update(task, completed=event.env_steps, note=note)
+            else:
+                flights = event.flights
+                bar.update(task, completed=event.rows[0]["env_steps"])
+                console.print(_line(event.rows, event.seconds_left))
+    return flights
+
+
+_HEADER = f"{'steps':>12} {'steps/s':>10} {'return':>20} {'success':>16} {'trained':>8} {'left':>7}"
+
+
+def _line(rows: list[Row], seconds_left: float) -> str:
+    first = rows[0]
+    return (
+        f"{first['env_steps']:>12,} {first['steps_per_second']:>10,.0f} {_spread(rows, 'return_mean', '.2f'):>20}"
+        f" {_spread(rows, 'success', '.3f'):>16} {_clock(first['train_seconds']):>8} {_clock(seconds_left):>7}"
+    )
+
+
+def _spread(rows: list[Row], name: str, form: str) -> str:
+    """The value, or median and [least … greatest] over seeds; a dash where it is not measured."""
+    values = np.array([row.get(name, float("nan")) for row in rows])
+    if np.isnan(values).all():
+        return "–"
+    if len(values) == 1:
+        return format(values[0], form)
+    return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"
+
+
+def _clock(seconds: float) -> str:
+    minutes, seconds = divmod(round(seconds), 60)
+    return f"{minutes}:{seconds:02d}"
+
+
+def _finish(out: Path, config: RunConfig, flights: Flights | None, seconds: float) -> None:
+    """Pictures, then summary.json of each seed, then that of the whole."""
+    folders = runs.members(out, config)
+    history = [runs.read_metrics(folder) for folder in folders]
+    for i, folder in enumerate(folders):
+        title = f"{config.task.name}, seed {config.seed + i}"
+        plots.learning_curve(folder / "learning_curve.png", [history[i]], title)
+        if flights is not None and config.task.spec:
+            shown = np.asarray(flights.observations[i, :PICTURE_FLIGHTS])
+            picture.flights(folder / "flight.png", _task(config), shown)
+        runs.write_json(folder / "summary.json", {"result": history[i][-1], "command_seconds": round(seconds, 1)})
+    if len(folders) > 1:
+        plots.learning_curve(out / "learning_curve.png", history, f"{config.task.name}, {len(folders)} seeds")
+        last = [rows[-1] for rows in history]
+        spread = {
+            name: {"median": float(np.median(v)), "min": float(np.min(v)), "max": float(np.max(v))}
+            for name in last[0]
+            if (v := [row.get(name, float("nan")) for row in last])
+        }
+        runs.write_json(out / "summary.json", {"seeds": spread, "command_seconds": round(seconds, 1)})
+    console.print(f"done in {_clock(seconds)}: {out}/summary.json, learning_curve.png; next: make evaluate RUN={out}")
+
+
+def _task(config: RunConfig) -> tasks.Task:
+    assert config.task.spec is not None
+    return tasks.from_data(config.task.spec, config.task.name)
+
+
+# -- evaluate ------------------------------------------------------------------------------------------------
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Fly every seed of a run from fresh starts; print a table, leave evaluation.json and a plot in each folder."""
+    config = request.stored(args.run)
+    env = request.environment(config.task)
+    starts = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), args.starts)
+    table: list[dict[str, Any]] = []
+    for i, folder in enumerate(runs.members(args.run, config)):
+        try:
+            trainer, state, env_steps = loop.restore(env, config, folder)
+        except FileNotFoundError as error:
+            raise BadInput(str(error)) from None
+        flights = jax.tree.map(lambda x: x[0], trainer.fly(state.learner, starts))
+        result = {"seed": config.seed + i, "env_steps": env_steps, "starts": args.starts, **summarise(flights)}
+        runs.write_json(folder / "evaluation.json", result)
+        if config.task.spec:
+            picture.errors(folder / "evaluation.png", _task(config), np.asarray(flights.observations))
+        table.append(result)
+    if config.seeds > 1:
+        runs.write_json(args.run / "evaluation.json", table)
+    _print_results(table, config)
+    return DONE
+
+
+def _print_results(table: list[dict[str, Any]], config: RunConfig) -> None:
+    console.print(f"{config.task.name}: {table[0]['starts']:,} fresh starts, deterministic policy")
+    names = [name for name in table[0] if name not in ("seed", "starts") and not _missing(table[0][name])]
+    width = max(len(name) for name in names)
+    console.print(f"{'seed':<{width}} " + " ".join(f"{row['seed']:>11}" for row in table))
+    for name in names:
+        console.print(f"{name:<{width}} " + " ".join(f"{_cell(name, row[name]):>11}" for row in table))
+
+
+def _missing(value: Any) -> bool:
+    return isinstance(value, float) and np.isnan(value)
+
+
+def _cell(name: str, value: float) -> str:
+    if name == "env_steps":
+        return f"{value:,}"
+    return f"{value:.2f}" if name.startswith("return") else f"{value:.4f}"

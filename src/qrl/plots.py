@@ -1,0 +1,100 @@
+"""The learning curve of a run, or of several seeds of it, as PNG; of matplotlib's objects alone, without pyplot."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+
+Rows = list[dict[str, float | str]]  # of metrics.csv: column -> number, as such or as text; "" where there is none
+
+BLUE, GREEN, INK = "#0072B2", "#009E73", "#333333"  # of Okabe and Ito's colours, for any eye
+PIXELS_PER_INCH = 150
+
+
+def learning_curve(path: Path, runs: list[Rows], title: str) -> None:
+    """Draw return and success over environment steps; `runs` holds one list of metrics.csv's rows for each seed."""
+    learning_curve_figure(runs, title).savefig(path, format="png")
+
+
+def learning_curve_figure(runs: list[Rows], title: str) -> Figure:
+    """What `learning_curve` saves. Axes: the return and, where any row has one, the success."""
+    steps, success = aligned(runs, "success")
+    has_success = bool(np.isfinite(success).any())
+    figure = Figure(figsize=(8.0, 5.4 if has_success else 3.6), dpi=PIXELS_PER_INCH, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK)
+    upper, *rest = figure.subplots(1 + has_success, 1, sharex=True, squeeze=False)[:, 0]
+    if len(runs) == 1:
+        worst = aligned(runs, "return_min")[1][0]
+        upper.plot(steps, worst, color=BLUE, alpha=0.45, linewidth=1.2, marker=_marker(steps), label="worst flight")
+    _draw(upper, steps, aligned(runs, "return_mean")[1], BLUE, "mean of flights")
+    _finish(upper, "return", steps)
+    for lower in rest:
+        _draw(lower, steps, success, GREEN)
+        lower.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0, symbol=" %"))
+        lower.set_ylim(-0.04, 1.04)
+        _finish(lower, "success", steps)
+    (rest or [upper])[-1].set_xlabel("environment steps", fontsize=11)
+    return figure
+
+
+def aligned(runs: list[Rows], key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Every number of environment steps in `runs`, [x], and their columns `key` there, [runs, x].
+
+    A run without a number there is interpolated; before its first number and after its last it is NaN.
+    """
+    tables = [np.array([(number(row, "env_steps"), number(row, key)) for row in rows]).reshape(-1, 2) for rows in runs]
+    steps = np.unique(np.concatenate([np.empty((0, 2)), *tables])[:, 0])
+    steps = steps[np.isfinite(steps)]
+    values = np.full((len(runs), len(steps)), np.nan)
+    for table, value in zip(tables, values, strict=True):
+        points = table[np.isfinite(table).all(axis=1)]
+        if len(points):
+            value[:] = np.interp(steps, *points[np.argsort(points[:, 0])].T, left=np.nan, right=np.nan)
+    return steps, values
+
+
+def number(row: dict[str, float | str], key: str) -> float:
+    """A cell of metrics.csv; NaN where it is absent, empty or no number."""
+    try:
+        return float(row.get(key, "nan"))
+    except ValueError:
+        return float("nan")
+
+
+def spread(values: np.ndarray) -> np.ndarray:
+    """(least, median, most) of the finite among `values` [runs, x] at each x: [3, x]; NaN where there are none."""
+    found = np.full((3, values.shape[1]), np.nan)
+    seen = np.isfinite(values).any(axis=0)
+    found[:, seen] = np.nanquantile(values[:, seen], [0.0, 0.5, 1.0], axis=0)
+    return found
+
+
+def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str = "") -> None:
+    """One run's line; of several their median, and a band from the least to the most; `values` [runs, x]."""
+    low, median, high = spread(values)
+    if len(values) > 1:
+        axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0, label="least to most")
+        axes.plot(steps, values.T, color=colour, alpha=0.35, linewidth=0.8)
+        label = f"median of {len(values)} seeds"
+    axes.plot(steps, median, color=colour, linewidth=2, marker=_marker(steps), label=label)
+
+
+def _marker(steps: np.ndarray) -> str:
+    return "o" if len(steps) == 1 else ""  # a line needs two
+
+
+def _finish(axes: Axes, label: str, steps: np.ndarray) -> None:
+    axes.set_ylabel(label, fontsize=11)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.tick_params(labelsize=10.5)
+    axes.xaxis.set_major_formatter(EngFormatter())
+    if steps.max(initial=0.0) > 0.0:
+        axes.set_xlim(0.0, 1.02 * steps.max())
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(loc="best", frameon=False, fontsize=10.5)
