@@ -66,12 +66,13 @@ setup: $(STAMP)
 	@echo '$(VENV) is ready'
 
 # ---- .venv -----------------------------------------------------------------------------------------------
-# The stamp is touched last, and `unfinished` lies in .venv while pip works: what an interrupted set-up left
-# is thrown away, not patched. So is a .venv that was moved here (its scripts name the place where it was
-# made) or whose interpreter is gone.
+# The stamp is taken away before pip begins and comes back last, so a .venv without one is what an interrupted
+# set-up left: it is made anew, not patched. So is one that was moved here (its scripts name the place where it
+# was made) or that has lost its interpreter or pyvenv.cfg; without that file its Python is the system's, and
+# `--require-virtualenv` is the last guard against installing there.
 
-here := test -x $(VENV)/bin/python && grep -qsF "$(CURDIR)/$(VENV)/" $(VENV)/bin
-whole := test ! -e $(VENV)/unfinished && $(here)/pip && $(VENV)/bin/python -c 'import pip' 2>/dev/null
+here := test -x $(VENV)/bin/python && test -e $(VENV)/pyvenv.cfg && grep -qsF "$(CURDIR)/$(VENV)/" $(VENV)/bin/qrl
+PIP := $(VENV)/bin/python -m pip --require-virtualenv --disable-pip-version-check -qq
 
 # What is wrong with $(PYTHON), in a line, or nothing.
 python_problem = $(shell $(PYTHON) -c 'import sys; from importlib import util; \
@@ -81,13 +82,18 @@ python_problem = $(shell $(PYTHON) -c 'import sys; from importlib import util; \
 	2>&1 | tail -n 1)
 stop_on = $(if $1,$(error $1))
 
-$(STAMP): requirements.lock pyproject.toml $(shell $(here)/qrl || echo FORCE)
+# The lock file is a lock in this sense too: a second make waits for the first, and finds nothing left to do.
+$(STAMP): requirements.lock pyproject.toml $(shell $(here) || echo FORCE)
 	$(call stop_on,$(python_problem))
-	@$(whole) || { echo 'making $(VENV) (once; a few minutes)'; rm -rf $(VENV)/bin && $(PYTHON) -m venv --clear $(VENV); }
-	@touch $(VENV)/unfinished
-	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check -r requirements.lock
-	@$(VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-deps -e .
-	@rm $(VENV)/unfinished
-	@touch $@
+	@set -e; exec 9<requirements.lock; \
+	if command -v flock >/dev/null; then flock -n 9 || { echo 'waiting: another make is at $(VENV)'; flock 9; }; fi; \
+	if test ! -e $@ || ! { $(here); }; then \
+		echo 'making $(VENV) (once; a few minutes)'; \
+		rm -f $@; rm -rf $(VENV); $(PYTHON) -m venv $(VENV); \
+	elif test $@ -nt requirements.lock && test $@ -nt pyproject.toml; then exit 0; fi; \
+	rm -f $@; \
+	$(PIP) install -r requirements.lock; \
+	$(PIP) install --no-deps -e .; \
+	touch $@
 
 FORCE:

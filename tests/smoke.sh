@@ -11,20 +11,26 @@ unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS OUT RESUME CONFIG ARGS RUN
 
 qrl=.venv/bin/qrl
 python=.venv/bin/python
-budget="--steps 1e5"      # a little beyond the warm-up
-long="--steps 1e6"        # long enough to be interrupted
+budget="--steps 1e5 --reports 3 --report-flights 10" # a little beyond the warm-up
+long="--steps 4e5 --reports 20 --report-flights 10"  # long enough to be interrupted after the first report
 vehicle=experiments/vehicles/crazyflie.json
 
 work=$(mktemp -d)
 out="$work/a run" # with a space: it must survive make and the shell
+log=$work
+tracks=()
 mkdir "$out"
-trap 'rm -rf "$work"' EXIT
+tidy() {
+  for pid in "${tracks[@]}"; do kill -- "-$pid" 2>/dev/null || true; done
+  rm -rf "$work"
+}
+trap tidy EXIT
 
 fail() {
   echo "smoke: FAILED: $1" >&2
-  for log in "$work/stdout" "$work/stderr"; do
-    echo "-- the end of ${log##*/}:" >&2
-    tail -n 30 "$log" >&2 || true
+  for file in "$log/stdout" "$log/stderr"; do
+    echo "-- the end of ${file##*/}:" >&2
+    tail -n 30 "$file" >&2 || true
   done
   exit 1
 }
@@ -37,23 +43,23 @@ try() {
 # Run "$2"… and expect it to succeed, without a traceback.
 passes() {
   try "$1"
-  "${@:2}" >"$work/stdout" 2>"$work/stderr" </dev/null || fail "$1: exit code $?"
-  ! grep -q Traceback "$work/stdout" "$work/stderr" || fail "$1: a traceback"
+  "${@:2}" >"$log/stdout" 2>"$log/stderr" </dev/null || fail "$1: exit code $?"
+  ! grep -q Traceback "$log/stdout" "$log/stderr" || fail "$1: a traceback"
 }
 
 # Run "$3"… and expect exit code 2 and one line on stderr, which matches the regular expression "$2".
 refuses() {
   local code=0
   try "refused: $1"
-  "${@:3}" >"$work/stdout" 2>"$work/stderr" </dev/null || code=$?
+  "${@:3}" >"$log/stdout" 2>"$log/stderr" </dev/null || code=$?
   ((code == 2)) || fail "$1: exit code $code, not 2"
-  (($(wc -l <"$work/stderr") == 1)) || fail "$1: $(wc -l <"$work/stderr") lines on stderr, not 1"
-  grep -qE "$2" "$work/stderr" || fail "$1: the line does not match /$2/"
+  (($(wc -l <"$log/stderr") == 1)) || fail "$1: $(wc -l <"$log/stderr") lines on stderr, not 1"
+  grep -qE -e "$2" "$log/stderr" || fail "$1: the line does not match /$2/"
 }
 
 # The run folder "$1" holds all that DESIGN.md says it does.
 complete() {
-  "$python" - "$1" >"$work/stdout" 2>"$work/stderr" <<'PYTHON' || fail "the run folder $1 is not complete"
+  "$python" - "$1" >"$log/stdout" 2>"$log/stderr" <<'PYTHON' || fail "the run folder $1 is not complete"
 import csv, json, math, sys
 from pathlib import Path
 
@@ -77,7 +83,7 @@ contents() {
 
 # The runs "$1" and "$2" tell the same story, clocks aside.
 same_metrics() {
-  "$python" - "$1" "$2" >"$work/stdout" 2>"$work/stderr" <<'PYTHON' || fail "$1 and $2 differ"
+  "$python" - "$1" "$2" >"$log/stdout" 2>"$log/stderr" <<'PYTHON' || fail "$1 and $2 differ"
 import csv, sys
 from pathlib import Path
 
@@ -91,84 +97,96 @@ assert first == second, next(pair for pair in zip(first, second) if pair[0] != p
 PYTHON
 }
 
-# ---- what works -----------------------------------------------------------------------------------------
+# ---- what is tried: two tracks side by side, for most of a command's time is one busy core ------------------
+
+pendulum_and_hover() {
+  passes "train pendulum, two seeds" make train TASK=pendulum SEEDS=2 OUT="$out/pendulum" ARGS="$budget"
+  complete "$out/pendulum/seed-0"
+  complete "$out/pendulum/seed-1"
+
+  passes "train hover" make train TASK=hover SEED=3 OUT="$out/hover" ARGS="$budget"
+  complete "$out/hover"
+  local before
+  before=$(contents "$out/hover")
+  passes "resume hover, finished" make train TASK=hover SEED=3 OUT="$out/hover" RESUME=1 ARGS="$budget"
+  [[ $(contents "$out/hover") == "$before" ]] || fail "resuming a finished run changed it"
+
+  refuses "a run folder that exists" "a run/hover" "$qrl" train hover --out "$out/hover"
+  refuses "to resume with another seed" "[Ss]eed" "$qrl" train hover --seed 4 --out "$out/hover" --resume
+  bad_input
+}
+
+bad_input() {
+  refuses "make train without TASK" "TASK is missing" make train
+  refuses "make evaluate without RUN" "RUN is missing" make evaluate
+  refuses "a misspelt task" "'hover'" "$qrl" train hoverr --out "$out/no"
+  refuses "a misspelt flag" "--stepz.*--steps" "$qrl" train hover --stepz 10 --out "$out/no"
+  refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --steps many --out "$out/no"
+  refuses "a run that is not there" "nowhere" "$qrl" evaluate "$out/nowhere"
+
+  echo '{"gama": 0.9}' >"$work/typo.json"
+  refuses "a misspelt key" "typo.json.*gama" "$qrl" train hover --config "$work/typo.json" --out "$out/no"
+
+  sed -E 's/("mass_kg": *)[0-9.]+/\1-1.0/' "$vehicle" >"$work/heavy.json"
+  refuses "a negative mass" "heavy.json.*mass_kg" "$qrl" train "$work/heavy.json" --out "$out/no"
+  [[ ! -e $out/no ]] || fail "a refused run left its folder"
+}
+
+circle_and_crazyflie() {
+  interrupted_circle
+  passes "resume circle" make train TASK=circle OUT="$out/circle" RESUME=1 ARGS="$long"
+  complete "$out/circle"
+  passes "evaluate circle" make evaluate RUN="$out/circle" ARGS="--starts 100"
+  "$python" -m json.tool "$out/circle/evaluation.json" >"$log/stdout" 2>"$log/stderr" || fail "evaluation.json"
+
+  passes "train a vehicle of one's own" make train TASK="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
+  complete "$out/crazyflie"
+  passes "repeat it from its config.json" make train CONFIG="$out/crazyflie/config.json" OUT="$out/again"
+  complete "$out/again"
+  same_metrics "$out/crazyflie" "$out/again"
+}
+
+interrupted_circle() {
+  try "train circle, and Ctrl-C after the first report"
+  set -m # else a background command starts deaf to SIGINT
+  # shellcheck disable=SC2086
+  "$qrl" train circle --out "$out/circle" $long >"$log/stdout" 2>"$log/stderr" </dev/null &
+  local pid=$! code=0
+  set +m
+  for ((i = 0; i < 1200; i++)); do
+    (($(cat "$out/circle/metrics.csv" 2>/dev/null | wc -l) >= 2)) && break
+    kill -0 "$pid" 2>/dev/null || break
+    sleep 0.1
+  done
+  kill -INT "$pid" 2>/dev/null || true
+  wait "$pid" || code=$?
+  ((code == 1)) || fail "Ctrl-C: exit code $code, not 1"
+  ! grep -q Traceback "$log/stdout" "$log/stderr" || fail "Ctrl-C: a traceback"
+  [[ ! -e $out/circle/summary.json ]] || fail "Ctrl-C: it went on to the end"
+}
+
 passes "make: the help" make
 passes "tasks" make tasks
 for task in pendulum hover circle; do
   grep -qw "$task" "$work/stdout" || fail "tasks does not list $task"
 done
 
-passes "train pendulum, two seeds" make train TASK=pendulum SEEDS=2 OUT="$out/pendulum" ARGS="$budget"
-complete "$out/pendulum/seed-0"
-complete "$out/pendulum/seed-1"
-
-passes "evaluate it" make evaluate RUN="$out/pendulum/seed-0"
-"$python" -m json.tool "$out/pendulum/seed-0/evaluation.json" /dev/null 2>"$work/stderr" || fail "evaluation.json"
-
-passes "train hover" make train TASK=hover SEED=3 OUT="$out/hover" ARGS="$budget"
-complete "$out/hover"
-
-passes "repeat it from its config.json" make train CONFIG="$out/hover/config.json" OUT="$out/again"
-complete "$out/again"
-same_metrics "$out/hover" "$out/again"
-
-before=$(contents "$out/hover")
-passes "resume what is finished" make train TASK=hover SEED=3 OUT="$out/hover" RESUME=1 ARGS="$budget"
-[[ $(contents "$out/hover") == "$before" ]] || fail "resuming a finished run changed it"
-
-try "train circle, and Ctrl-C"
-set -m # else a background command starts deaf to SIGINT
-# shellcheck disable=SC2086
-"$qrl" train circle --out "$out/circle" $long >"$work/stdout" 2>"$work/stderr" </dev/null &
-pid=$!
-set +m
-for ((i = 0; i < 600; i++)); do
-  (($(cat "$out/circle/metrics.csv" 2>/dev/null | wc -l) >= 2)) && break
-  kill -0 "$pid" 2>/dev/null || break
-  sleep 0.1
+set -m # each track a process group, so that Ctrl-C here ends all of it
+for track in pendulum_and_hover circle_and_crazyflie; do
+  (
+    trap - EXIT
+    log=$work/$track
+    mkdir "$log"
+    $track
+  ) &
+  tracks+=($!)
 done
-kill -INT "$pid" 2>/dev/null || true
-code=0
-wait "$pid" || code=$?
-((code == 0 || code == 1)) || fail "Ctrl-C: exit code $code"
-! grep -q Traceback "$work/stderr" || fail "Ctrl-C: a traceback"
-
-passes "resume it" make train TASK=circle OUT="$out/circle" RESUME=1 ARGS="$long"
-complete "$out/circle"
-
-passes "evaluate it" make evaluate RUN="$out/circle"
-
-passes "train a vehicle of one's own" make train TASK="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
-complete "$out/crazyflie"
-
-# ---- what is refused -------------------------------------------------------------------------------------
-refuses "make train without TASK" "TASK is missing" make train
-refuses "make evaluate without RUN" "RUN is missing" make evaluate
-
-refuses "a misspelt task" "hover" "$qrl" train hoverr --out "$out/no"
-refuses "a misspelt flag" "stepz" "$qrl" train hover --stepz 10 --out "$out/no"
-refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --steps many --out "$out/no"
-refuses "a run folder that exists" "hover" "$qrl" train hover --out "$out/hover"
-refuses "to resume with another seed" "[Ss]eed" "$qrl" train hover --seed 4 --out "$out/hover" --resume
-refuses "a run that is not there" "nowhere" "$qrl" evaluate "$out/nowhere"
-
-echo '{"gama": 0.9}' >"$work/typo.json"
-refuses "a misspelt key" "typo.json.*gama" "$qrl" train hover --config "$work/typo.json" --out "$out/no"
-
-"$python" - "$vehicle" "$work/heavy.json" <<'PYTHON'
-import json, sys
-
-def negative(value):
-    if isinstance(value, dict):
-        return {k: -1.0 if k == "mass_kg" else negative(v) for k, v in value.items()}
-    return value
-
-task = json.load(open(sys.argv[1]))
-assert negative(task) != task, "the example vehicle has no mass_kg to spoil"
-json.dump(negative(task), open(sys.argv[2], "w"))
-PYTHON
-refuses "a negative mass" "heavy.json.*mass_kg" "$qrl" train "$work/heavy.json" --out "$out/no"
-
-[[ ! -e $out/no ]] || fail "a refused run left its folder"
-echo "smoke: passed in $SECONDS s"
-((SECONDS <= 180)) || fail "it took more than three minutes"
+set +m
+for pid in "${tracks[@]}"; do
+  wait "$pid" || exit 1
+done
+# Three minutes of two cores, counted in what they worked: a busy machine is not a fault of ours.
+times >"$work/times"
+cpu=$(tail -n 1 "$work/times" | tr 'ms' '  ' | awk '{ printf "%d", 60 * ($1 + $3) + $2 + $4 }')
+echo "smoke: passed in $SECONDS s ($cpu s of CPU time)"
+((cpu <= 360)) || fail "it worked for more than three minutes of two cores"

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from qrl_envs import env, measures
@@ -80,6 +80,7 @@ def test_flights_are_as_long_as_design_says() -> None:
 settle = jax.jit(measures.settle_s)
 
 
+@settings(deadline=None, derandomize=True, database=None)
 @given(st.lists(st.booleans(), min_size=12, max_size=12))
 def test_settle_time_is_the_loops(within: list[bool]) -> None:
     """For any pattern of 12 samples."""

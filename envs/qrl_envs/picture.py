@@ -4,6 +4,7 @@ What is measured is what measures.py measures, and every tolerance drawn is the 
 from being saved, of matplotlib's objects alone: no pyplot, so no state is left behind.
 """
 
+import functools
 import textwrap
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -15,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MultipleLocator
+from matplotlib.ticker import FuncFormatter, MultipleLocator, NullFormatter
 
 from qrl_envs import measures
 from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
@@ -114,19 +115,25 @@ def errors_figure(task: Task, observations: np.ndarray) -> Figure:
 
 def _measure(task: Task, observations: np.ndarray) -> Measured:
     """measures.py of each of `observations` [n, K + 1, F]."""
+    errors, summary = jax.tree.map(np.asarray, _measured(task, jnp.asarray(observations, jnp.float32)))
+    return Measured(errors, summary["success"] > 0, summary["settle_s"])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _measured(task: Task, observations: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+    """Errors [n, K + 1] and summary [n] of `observations` [n, K + 1, F]."""
     dt_s = task.control_period_s
 
-    def one(flight: jax.Array) -> tuple[measures.Errors, dict[str, jax.Array]]:
+    def one(flight: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
         if isinstance(task, PendulumTask):
             found = measures.pendulum(flight, task.evaluation)
         elif isinstance(wanted := task.evaluation.reward, CircleReward):
             found = measures.circle(flight, task.evaluation, wanted.radius_m, wanted.speed_m_s)
         else:
             found = measures.hover(flight, task.evaluation)
-        return found, measures.summarise(found, round(task.evaluation.tail_s / dt_s), dt_s)
+        return found.errors, measures.summarise(found, round(task.evaluation.tail_s / dt_s), dt_s)
 
-    found, summary = jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(jnp.asarray(observations, jnp.float32)))
-    return Measured(found.errors, summary["success"] > 0, summary["settle_s"])
+    return jax.vmap(one)(observations)
 
 
 # Where flights went
@@ -202,7 +209,7 @@ def _turns(angle: np.ndarray) -> list[np.ndarray]:
 
 def _quadrotor_panels(task: QuadrotorTask, shown: np.ndarray, errors: dict[str, np.ndarray]) -> tuple[Panel, Panel]:
     spec, wanted = task.evaluation, task.evaluation.reward
-    few = {name: error[: len(shown)] for name, error in errors.items()}
+    few = {name: np.where(np.isfinite(error), error, np.nan)[: len(shown)] for name, error in errors.items()}
     if isinstance(wanted, CircleReward) and spec.speed_m_s is not None:
         distance, speed = np.hypot(few["radius_m"], few["height_m"]), few["speed_m_s"] + wanted.speed_m_s
         return (
@@ -264,6 +271,7 @@ def _over_time(axes: Axes, task: Task, panel: Panel) -> np.ndarray:
     axes.set_yscale("log" if panel.scale == "log" else "linear")
     if panel.scale == "log":
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     elif panel.scale == "angle":
         _in_pi(axes.yaxis)
     elif panel.unit == "°":
@@ -307,7 +315,7 @@ def _figure(task: Task, height_in: float) -> Figure:
     figure = Figure(figsize=(10.0, height_in), dpi=PIXELS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     what = textwrap.shorten(f"{task.reward.form}: {task.description}", 90, placeholder=" …")
-    figure.suptitle(what, fontsize=13, fontweight="bold", color=INK)
+    figure.suptitle(what, fontsize=13, fontweight="bold", color=INK, parse_math=False)
     return figure
 
 

@@ -41,6 +41,8 @@ def matrix(q: chex.Array) -> chex.Array:
     )
 
 
-def uniform(key: chex.PRNGKey) -> chex.Array:
-    """A rotation drawn uniformly from SO(3), as a unit quaternion [4] (a normal draw in R⁴, normalised)."""
-    return normalise(jax.random.normal(key, (4,)))
+def uniform(u: chex.Array) -> chex.Array:
+    """A rotation uniform over SO(3), as a unit quaternion [4], from u [3] uniform in [0, 1) (Shoemake 1992)."""
+    a, b = 2.0 * jnp.pi * u[1], 2.0 * jnp.pi * u[2]
+    s, c = jnp.sqrt(1.0 - u[0]), jnp.sqrt(u[0])
+    return jnp.stack([s * jnp.sin(a), s * jnp.cos(a), c * jnp.sin(b), c * jnp.cos(b)])

@@ -89,20 +89,24 @@ def build(kind: type[T] | Any, data: dict[str, Any], where: str) -> T:
 
 def _first_line(error: ValidationError, kind: Any) -> str:
     # A misspelt key is the likelier cause than the key then missing, so it is named first.
-    problems = sorted(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
-    problem = problems[0]
+    problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     model, path = _follow(kind, problem["loc"])
+    context = problem.get("ctx", {})
+    if problem["type"] in ("union_tag_invalid", "union_tag_not_found"):
+        key = ".".join([*path, context["discriminator"].strip("'")])
+        expected = context.get("expected_tags") or ", ".join(map(repr, filter(None, map(_tag, _models(kind)))))
+        return f"key '{key}': expected one of {expected}, found {json.dumps(context.get('tag'))}"
     key = ".".join(path)
     if problem["type"] == "extra_forbidden":
         return f"unknown key '{key}'{nearest(path[-1], list(model.model_fields)) if model else ''}"
     if problem["type"] == "missing":
         return f"key '{key}' is missing"
-    message = problem["msg"].removeprefix("Value error, ")
-    expected = message[0].lower() + message[1:]
-    if not key:
-        return expected
+    if problem["type"] == "value_error":  # our own validators say what they found themselves
+        return f"key '{key}': {context['error']}" if key else str(context["error"])
     found = json.dumps(problem["input"], default=str)
-    return f"key '{key}': {expected}, found {found if len(found) < 60 else found[:57] + '...'}"
+    message = problem["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
+    message = message[0].lower() + message[1:]
+    return f"{f'key {key!r}: ' if key else ''}{message}, found {found if len(found) < 60 else found[:57] + '...'}"
 
 
 def _models(kind: Any) -> list[type[BaseModel]]:

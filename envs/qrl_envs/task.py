@@ -30,7 +30,7 @@ class Vehicle(Spec):
     @model_validator(mode="after")
     def _possible(self) -> "Vehicle":
         x, y, z = self.inertia_kg_m2
-        if 2 * max(x, y, z) > x + y + z:
+        if 2 * max(x, y, z) > (x + y + z) * (1 + 1e-9):  # equality: a flat plate
             raise ValueError(
                 f"expected inertia_kg_m2 of a rigid body: no moment above the sum of the other two, found {x}, {y}, {z}"
             )

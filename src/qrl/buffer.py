@@ -31,11 +31,16 @@ def add(ring: Ring, unroll: chex.ArrayTree) -> Ring:
     return Ring(data, ring.inserted + 1)
 
 
-def sample(ring: Ring, key: chex.PRNGKey, trajectories: int) -> chex.ArrayTree:
-    """`trajectories` pairs (slot, lane) drawn uniformly, with replacement, from the filled slots; leaves [B, T, ...].
+def draw(ring: Ring, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
+    """Indices of trajectories (slot, lane), uniform with replacement over the filled slots; int32 [*shape].
 
-    The ring must hold at least one unroll.
+    The ring must hold at least one unroll. Drawn for many minibatches at once: a draw costs far more to
+    compile, and more to run, than the gather.
     """
     slots, lanes = jax.tree.leaves(ring.data)[0].shape[:2]
-    index = jax.random.randint(key, (trajectories,), 0, jnp.minimum(ring.inserted, slots) * lanes)
-    return jax.tree.map(lambda d: d.reshape(slots * lanes, *d.shape[2:])[index], ring.data)
+    return jax.random.randint(key, shape, 0, jnp.minimum(ring.inserted, slots) * lanes)
+
+
+def gather(ring: Ring, index: chex.Array) -> chex.ArrayTree:
+    """The trajectories at `index` [B]; leaves [B, T, ...]."""
+    return jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[index], ring.data)

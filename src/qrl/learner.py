@@ -113,7 +113,7 @@ class Learner:
             params=Networks(policy, critic), optimiser=Networks(policy_opt, critic_opt), updates=state.updates + 1
         )
         terms = terms._replace(
-            policy_gradient=optax.global_norm(gradient.policy), value_gradient=optax.global_norm(gradient.critic)
+            policy_gradient=optax.tree.norm(gradient.policy), value_gradient=optax.tree.norm(gradient.critic)
         )
         return self._averaged(state), terms
 

@@ -25,7 +25,7 @@ def learning_curve_figure(runs: list[Rows], title: str) -> Figure:
     has_success = bool(np.isfinite(success).any())
     figure = Figure(figsize=(8.0, 5.4 if has_success else 3.6), dpi=PIXELS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK)
+    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK, parse_math=False)
     upper, *rest = figure.subplots(1 + has_success, 1, sharex=True, squeeze=False)[:, 0]
     if len(runs) == 1:
         worst = aligned(runs, "return_min")[1][0]

@@ -86,9 +86,9 @@ def unroll(
     noise_key, key = jax.random.split(key)
     noise = jax.random.normal(noise_key, (unroll_steps, lanes.steps.shape[0], env.action_size))
 
-    def step(lanes: Lanes, x: tuple[chex.Array, chex.PRNGKey]) -> tuple[Lanes, Transition]:
-        noise, key = x
-        lanes = _restart(env, lanes, key)
+    def step(lanes: Lanes, x: tuple[chex.Array, chex.Array]) -> tuple[Lanes, Transition]:
+        t, noise = x
+        lanes = _restart(env, lanes, jax.random.fold_in(key, t))
         observation = lanes.state.obs
         center = mean(observation)
         action = center + sigma * noise
@@ -110,5 +110,5 @@ def unroll(
         early = lanes.early + (done & (steps < longest))
         return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition
 
-    lanes, transitions = jax.lax.scan(step, lanes, (noise, jax.random.split(key, unroll_steps)))
+    lanes, transitions = jax.lax.scan(step, lanes, (jnp.arange(unroll_steps), noise))
     return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)

@@ -1,0 +1,166 @@
+"""The update: what it minimises, and what its options mean."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qrl import runs
+from qrl.config import Config
+from qrl.learner import Learner
+from qrl.networks import log_density
+from qrl.types import Transition
+
+B, T, F, A = 3, 7, 5, 2
+
+
+def config(**changes: object) -> Config:
+    return Config.model_validate(runs.preset("default") | {"normalise_observations": False} | changes, strict=False)
+
+
+def batch(seed: int = 0) -> Transition:
+    rng = np.random.default_rng(seed)
+    ended = rng.random((B, T)) < 0.3
+    terminated = ended & (rng.random((B, T)) < 0.5)
+    values = Transition(
+        observation=rng.normal(size=(B, T, F)),
+        action=rng.normal(size=(B, T, A)),
+        log_mu=rng.normal(size=(B, T)) - 2.0,
+        reward=rng.normal(size=(B, T)),
+        next_observation=rng.normal(size=(B, T, F)),
+        terminated=terminated,
+        truncated=ended & ~terminated,
+    )
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
+
+
+def losses(learner: Learner, data: Transition) -> tuple[float, float]:
+    _, terms = jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)
+    return float(terms.policy_loss), float(terms.value_loss)
+
+
+def mlp(params: dict, x: np.ndarray) -> np.ndarray:
+    layers = [params["params"][f"Dense_{i}"] for i in range(len(params["params"]))]
+    for i, layer in enumerate(layers):
+        x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+        x = np.maximum(x, 0.0) if i < len(layers) - 1 else x
+    return x
+
+
+def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tuple[float, float]:
+    """Algorithm 1 and the paper's two losses for one minibatch, sample by sample in float64."""
+    c, state = learner.config, learner.init(jax.random.PRNGKey(1))
+    scale = np.asarray(c.observation_scale or (1.0,) * F)
+    d = jax.tree.map(lambda x: np.asarray(x, np.float64), data)
+    v = mlp(state.params.critic, d.observation * scale)[..., 0]
+    v_next = mlp(state.params.critic, d.next_observation * scale)[..., 0]
+    mean = mlp(state.params.policy, d.observation * scale)
+    log_pi = (-0.5 * ((d.action - mean) / c.sigma) ** 2 - np.log(c.sigma) - 0.5 * np.log(2 * np.pi)).sum(-1)
+    ratio = np.exp(log_pi - d.log_mu)
+    a_trace, v_trace = np.zeros((B, T)), np.zeros((B, T))
+    for b in range(B):
+        carried = 0.0
+        for i in reversed(range(T)):
+            carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
+            bootstrap = 0.0 if d.terminated[b, i] else v_next[b, i]
+            a_trace[b, i] = c.reward_scale * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
+            carried = (min(1.0, ratio[b, i]) if off_policy else 1.0) * a_trace[b, i]
+            v_trace[b, i] = v[b, i] + carried
+    a = a_trace / np.sqrt((a_trace**2).mean()) if c.normalise_advantage else a_trace
+    gain = (ratio - 1.0) * a if c.form == "ratio" else (np.exp(log_pi) - np.exp(d.log_mu)) * a
+    limit = c.epsilon * np.abs(a) if c.xi is None else c.xi
+    return -np.minimum(gain, limit).mean(), ((v - v_trace) ** 2).mean()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"normalise_advantage": False, "observation_scale": [1.0, 0.5, 2.0, 1.0, 1.0]},
+        {"form": "difference", "xi": 0.01},
+        {"advantage": "mu", "form": "difference"},
+        {"advantage": "mu", "lam": 0.9},
+    ],
+    ids=["paper", "scaled", "condition 3, constant margin", "condition 1", "condition 2: PPO with GAE"],
+)
+def test_losses_are_the_papers(changes: dict) -> None:
+    """L_policy and L_value of Sec. 4 and Algorithm 1, against a literal loop, for each condition."""
+    learner = Learner(config(**changes), F, A)
+    expected = literal_losses(learner, batch(), off_policy=learner.config.advantage == "pi")
+    np.testing.assert_allclose(losses(learner, batch()), expected, rtol=2e-4)
+
+
+def test_update_ascends_both_losses() -> None:
+    """Repeated updates on one batch lower the value loss and raise the objective."""
+    learner = Learner(config(learning_rate=1e-2, steps=1_000_000), F, A)
+    data, update = batch(), jax.jit(learner.update)
+    state, first = update(learner.init(jax.random.PRNGKey(1)), data)
+    for _ in range(30):
+        state, last = update(state, data)
+    assert last.policy_loss < first.policy_loss
+    assert last.value_loss < first.value_loss
+
+
+def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
+    """Targets and advantages are constants: scaling rewards by −1 leaves the critic's own pull, not a mixed one."""
+    learner = Learner(config(normalise_advantage=False), F, A)
+    state, data = learner.init(jax.random.PRNGKey(1)), batch()
+    gradient = jax.grad(lambda p: learner._loss(p, state, data)[0])(state.params)
+
+    def critic_only(critic: object) -> jax.Array:
+        target = jax.lax.stop_gradient
+        params = state.params._replace(critic=critic)
+        value = learner.critic.apply(critic, data.observation)[..., 0]
+        loss, terms = learner._loss(params, state, data)
+        del loss
+        # value_loss = mean (V − V^trace)²: its gradient with a constant target is 2·mean (V − V^trace)·dV.
+        _, v_trace = _traces(learner, state, data)
+        return jnp.mean((value - target(v_trace)) ** 2) + 0.0 * terms.value
+
+    expected = jax.grad(critic_only)(state.params.critic)
+    jax.tree.map(lambda g, e: np.testing.assert_allclose(g, e, atol=1e-5), gradient.critic, expected)
+
+
+def _traces(learner: Learner, state: object, data: Transition) -> tuple[jax.Array, jax.Array]:
+    from qrl.vtrace import vtrace
+
+    c = learner.config
+    value = learner.critic.apply(state.params.critic, data.observation)[..., 0]
+    after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
+    log_pi = log_density(data.action, learner.policy.apply(state.params.policy, data.observation), c.sigma)
+    rho = jnp.exp(log_pi - data.log_mu)
+    return jax.vmap(lambda *x: vtrace(*x, gamma=c.gamma, lam=c.lam))(
+        c.reward_scale * data.reward, value, after, data.terminated, data.truncated, rho
+    )
+
+
+def test_sigma_is_log_linear_and_ends_where_it_should() -> None:
+    """sigma at the start, sigma_end after the last update, the geometric mean half-way."""
+    learner = Learner(config(sigma=0.4, sigma_end=0.1), F, A)
+    state = learner.init(jax.random.PRNGKey(0))
+    at = lambda share: float(learner.sigma(state._replace(updates=jnp.int32(round(share * learner.total_updates)))))  # noqa: E731
+    np.testing.assert_allclose([at(0.0), at(0.5), at(1.0)], [0.4, 0.2, 0.1], rtol=1e-4)
+
+
+def test_average_is_the_mean_of_the_last_policies() -> None:
+    """With averaging on, what ships is the arithmetic mean of the policies of the run's last part."""
+    learner = Learner(config(steps=64 * 50 * 5, warmup_unrolls=1, updates_per_unroll=4, average_fraction=0.5), F, A)
+    state, data, update = learner.init(jax.random.PRNGKey(1)), batch(), jax.jit(learner.update)
+    policies = []
+    for _ in range(learner.total_updates):
+        state, _ = update(state, data)
+        policies.append(state.params.policy)
+    last = policies[learner.total_updates // 2 :]
+    expected = jax.tree.map(lambda *p: np.mean(p, axis=0), *last)
+    shipped = learner.shipped(state).params.policy
+    jax.tree.map(lambda s, e: np.testing.assert_allclose(s, e, rtol=1e-5, atol=1e-6), shipped, expected)
+
+
+def test_observation_statistics_standardise() -> None:
+    """With normalise_observations the networks see zero mean and unit deviation."""
+    learner = Learner(config(normalise_observations=True), F, A)
+    data = 3.0 + 2.0 * jax.random.normal(jax.random.PRNGKey(2), (4000, F))
+    state = learner.observe(learner.init(jax.random.PRNGKey(0)), data)
+    seen = learner.scale(state, data)
+    np.testing.assert_allclose(np.mean(seen, 0), 0.0, atol=1e-2)
+    np.testing.assert_allclose(np.std(seen, 0), 1.0, atol=1e-2)

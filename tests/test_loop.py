@@ -1,0 +1,164 @@
+"""A run on the host: it can stop anywhere and go on to the same bits, and seeds side by side do not mix."""
+
+import csv
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import Env, State
+
+from qrl import checkpoint, loop, runs
+from qrl.config import Config
+from qrl.runs import RunConfig, TaskRecord
+from qrl_envs import env as worlds
+
+SMALL = {
+    "steps": 1200,
+    "lanes": 4,
+    "unroll_steps": 10,
+    "ring_unrolls": 3,
+    "warmup_unrolls": 2,
+    "updates_per_unroll": 2,
+    "minibatch_lanes": 2,
+    "policy_hidden": [8],
+    "critic_hidden": [8],
+    "reports": 6,
+    "report_flights": 3,
+    "normalise_observations": True,
+}
+
+
+@pytest.fixture(autouse=True)
+def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop, "CHUNK_SECONDS", 1e-4)  # pause after every unroll or two
+
+
+def run_config(seed: int = 0, seeds: int = 1, **changes: object) -> RunConfig:
+    learner = Config.model_validate(runs.preset("default") | SMALL | changes, strict=False)
+    return RunConfig(task=TaskRecord(name="pendulum", spec=None), learner=learner, seed=seed, seeds=seeds, versions={}, devices=[])
+
+
+def train(out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_after: int | None = None) -> list[loop.Event]:
+    """Run to the end, or until `stop_after` events beyond compilation."""
+    for folder in runs.members(out, run):
+        folder.mkdir(parents=True, exist_ok=True)
+    seen: list[loop.Event] = []
+
+    def stopped() -> bool:
+        return stop_after is not None and sum(not isinstance(e, loop.Compiling) for e in seen) >= stop_after
+
+    for event in loop.train(env, run, out, resume=resume, stopped=stopped):
+        seen.append(event)
+    return seen
+
+
+def metrics(folder: Path) -> list[dict[str, str]]:
+    """metrics.csv without its clocks."""
+    with (folder / "metrics.csv").open() as file:
+        return [{k: v for k, v in row.items() if not k.endswith(("train_seconds", "_per_second"))} for row in csv.DictReader(file)]
+
+
+def last_state(folder: Path, run: RunConfig, env: Env) -> list[np.ndarray]:
+    _, state, _ = loop.restore(env, run, folder)
+    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+
+
+def assert_same(first: list[np.ndarray], second: list[np.ndarray]) -> None:
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Env:
+    return worlds.make("pendulum")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, pendulum: Env) -> Path:
+    out = tmp_path_factory.mktemp("whole")
+    train(out, run_config(), pendulum)
+    return out
+
+
+def test_run_ends_at_its_steps_with_a_row_a_report(whole: Path) -> None:
+    """Every report is a row; the last row is the last step; learning waited for the warm-up."""
+    rows = runs.read_metrics(whole)
+    assert [row["env_steps"] for row in rows] == [200, 400, 600, 800, 1000, 1200]
+    assert rows[-1]["updates"] == (30 - 2 + 1) * 2
+    assert {"env_steps", "updates", "return_mean", "return_min", "success", "train_seconds"} <= set(rows[0])
+
+
+@pytest.mark.parametrize("stop_after", [1, 3, 4])
+def test_resumed_run_equals_one_never_stopped(tmp_path: Path, pendulum: Env, whole: Path, stop_after: int) -> None:
+    """Stopped between or at reports and resumed: the same last state and metrics, bit for bit, clocks aside."""
+    events = train(tmp_path, run_config(), pendulum, stop_after=stop_after)
+    assert not any(isinstance(e, loop.Reported) and e.rows[0]["env_steps"] == 1200 for e in events)
+    train(tmp_path, run_config(), pendulum, resume=True)
+    assert_same(last_state(tmp_path, run_config(), pendulum), last_state(whole, run_config(), pendulum))
+    assert metrics(tmp_path) == metrics(whole)
+
+
+def test_rows_after_the_checkpoint_are_cut(tmp_path: Path, pendulum: Env, whole: Path) -> None:
+    """Killed before the last checkpoint was made: its row is made again, once."""
+    train(tmp_path, run_config(), pendulum)
+    with checkpoint.manager(tmp_path) as saved:
+        saved.delete(1200)
+    train(tmp_path, run_config(), pendulum, resume=True)
+    assert metrics(tmp_path) == metrics(whole)
+
+
+def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, whole: Path) -> None:
+    """On a CPU a member's state equals, bit for bit, that of the single run of its seed."""
+    pair = run_config(seeds=2)
+    train(tmp_path / "pair", pair, pendulum)
+    train(tmp_path / "one", run_config(seed=1), pendulum)
+    for folder, single in ((tmp_path / "pair" / "seed-0", whole), (tmp_path / "pair" / "seed-1", tmp_path / "one")):
+        assert_same(last_state(folder, run_config(), pendulum), last_state(single, run_config(), pendulum))
+        assert metrics(folder) == metrics(single)
+
+
+class Poisoned(Env):
+    """Counts steps; from step `bad` on the reward is not a number."""
+
+    observation_size, action_size, backend = 2, 1, "test"  # pyright: ignore[reportAssignmentType]
+    episode_steps = 1000
+
+    def __init__(self, bad: float) -> None:
+        self.bad = bad
+
+    def reset(self, rng: jax.Array) -> State:
+        obs = jax.random.normal(rng, (2,)).at[0].set(0.0)
+        return State(None, obs, jnp.float32(0), jnp.float32(0))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        obs = state.obs.at[0].add(1.0)
+        return state.replace(obs=obs, reward=jnp.where(obs[0] > self.bad, jnp.nan, action[0]))
+
+
+def test_nan_stops_the_run_and_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
+    """The message names term, update and checkpoint; the checkpoint holds only finite numbers."""
+    env = Poisoned(bad=100.0)
+    with pytest.raises(loop.NotFinite, match=r"reward is not finite in update 18; the checkpoint at step 400 is kept"):
+        train(tmp_path, run_config(), env)
+    assert all(np.isfinite(leaf).all() for leaf in last_state(tmp_path, run_config(), env))
+    assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [200, 400]
+
+
+def test_fault_in_the_learner_is_named(tmp_path: Path, pendulum: Env) -> None:
+    """A step size that blows the networks up is found in the learner's own terms, not in the world."""
+    with pytest.raises(loop.NotFinite, match=r"(log_rho|value|a_trace|_loss|_gradient|reward|observation) is not finite"):
+        train(tmp_path, run_config(learning_rate=1e30, learning_rate_end=1e30), pendulum)
+
+
+def test_no_checkpoint_is_said(tmp_path: Path, pendulum: Env) -> None:
+    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+        loop.restore(pendulum, run_config(), tmp_path)
+
+
+def test_stop_before_the_first_step_saves_nothing(tmp_path: Path, pendulum: Env) -> None:
+    train(tmp_path, run_config(), pendulum, stop_after=0)
+    assert runs.read_metrics(tmp_path) == []
+
+
