@@ -153,6 +153,7 @@ interrupted_circle() {
   "$qrl" train circle --out "$out/circle" $long >"$log/stdout" 2>"$log/stderr" </dev/null &
   local pid=$! code=0
   set +m
+  trap 'kill -KILL "$pid"; exit 1' TERM # in a process group of its own, it would outlive this script
   for ((i = 0; i < 1200; i++)); do
     (($(cat "$out/circle/metrics.csv" 2>/dev/null | wc -l) >= 2)) && break
     kill -0 "$pid" 2>/dev/null || break
@@ -160,6 +161,7 @@ interrupted_circle() {
   done
   kill -INT "$pid" 2>/dev/null || true
   wait "$pid" || code=$?
+  trap - TERM
   ((code == 1)) || fail "Ctrl-C: exit code $code, not 1"
   ! grep -q Traceback "$log/stdout" "$log/stderr" || fail "Ctrl-C: a traceback"
   [[ ! -e $out/circle/summary.json ]] || fail "Ctrl-C: it went on to the end"

@@ -48,6 +48,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "checkpoint": 3,
         "runs": 3,
         "plots": 3,
+        "exits": 4,
         "request": 4,
         "commands": 4,
         "cli": 4,

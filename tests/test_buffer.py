@@ -21,7 +21,13 @@ Array = np.ndarray
 SLOTS, LANES, STEPS, BATCH = 4, 3, 5, 512
 ADDS = range(2 * SLOTS + 2)  # from an empty ring to the second time around
 
-add, sample = jax.jit(buffer.add), jax.jit(buffer.sample, static_argnums=2)
+add = jax.jit(buffer.add)
+
+
+@jax.jit
+def sample(ring: Ring, key: jax.Array) -> Any:
+    """BATCH trajectories, drawn as two minibatches at once."""
+    return buffer.gather(ring, buffer.draw(ring, key, (2, BATCH // 2)).reshape(BATCH))
 
 
 def tag(unroll: Array | int, lane: Array | int) -> Array:
@@ -106,7 +112,7 @@ def test_sampled_trajectories_are_those_flashbax_samples(
     """The same set of whole trajectories, at every fill."""
     their_sample = jax.jit(theirs.sample)
     for i in ADDS:
-        drawn = sample(ring_after[i + 1], jax.random.key(i), BATCH)
+        drawn = sample(ring_after[i + 1], jax.random.key(i))
         expected = their_sample(theirs_after[i + 1], jax.random.key(i)).experience
         for name, leaf in drawn.items():
             np.testing.assert_array_equal(np.unique(leaf, axis=0), np.unique(expected[name], axis=0))
@@ -115,7 +121,7 @@ def test_sampled_trajectories_are_those_flashbax_samples(
 @pytest.mark.parametrize("adds", range(1, len(ADDS) + 1))
 def test_samples_are_whole_trajectories_of_filled_slots(adds: int, ring_after: list[Ring]) -> None:
     """Every leaf of a row is one trajectory from its first step to its last, and all that are kept turn up."""
-    drawn = sample(ring_after[adds], jax.random.key(adds), BATCH)
+    drawn = sample(ring_after[adds], jax.random.key(adds))
     trajectory, step = np.asarray(drawn["trajectory"][:, :1]), np.arange(STEPS)
     np.testing.assert_array_equal(drawn["trajectory"], np.repeat(trajectory, STEPS, axis=1))
     whole = np.stack([trajectory + 0 * step, step + 0 * trajectory, trajectory * step], axis=-1)
@@ -131,7 +137,7 @@ def test_samples_are_uniform_and_independent(adds: int, ring_after: list[Ring]) 
     count = 0
     pairs = np.zeros((len(kept(adds)), len(kept(adds))))
     for seed in range(16):
-        drawn = sample(ring_after[adds], jax.random.key(100 + seed), BATCH)["trajectory"][:, 0]
+        drawn = sample(ring_after[adds], jax.random.key(100 + seed))["trajectory"][:, 0]
         index = np.searchsorted(kept(adds), drawn)
         count = count + np.bincount(index, minlength=len(kept(adds)))
         np.add.at(pairs, (index[0::2], index[1::2]), 1)
@@ -141,7 +147,7 @@ def test_samples_are_uniform_and_independent(adds: int, ring_after: list[Ring]) 
 
 def test_the_key_decides_the_sample(ring_after: list[Ring]) -> None:
     """The same key draws the same, another another."""
-    first, again, other = (sample(ring_after[-1], jax.random.key(seed), BATCH)["trajectory"] for seed in (0, 0, 1))
+    first, again, other = (sample(ring_after[-1], jax.random.key(seed))["trajectory"] for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
 

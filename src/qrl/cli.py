@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from qrl.config import Config
-
-DONE, FAILED, WRONG_INPUT = 0, 1, 2
+from qrl.exits import FAILED, WRONG_INPUT, complain
 
 
 class _Parser(argparse.ArgumentParser):
@@ -26,11 +25,6 @@ class _Parser(argparse.ArgumentParser):
             message = f"unknown flag {unknown} " + (f"(did you mean {close[0]}?)" if close else f"(see {self.prog} --help)")
         complain(message)
         sys.exit(WRONG_INPUT)
-
-
-def complain(message: str) -> None:
-    """One line on stderr."""
-    print(f"qrl: {' '.join(message.split())}", file=sys.stderr)
 
 
 def whole_number(text: str) -> int:

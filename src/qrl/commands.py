@@ -15,8 +15,8 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from qrl import loop, plots, request, runs
-from qrl.cli import DONE, FAILED, WRONG_INPUT, complain
 from qrl.evaluate import Flights, summarise
+from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.runs import Row, RunConfig
 from qrl_envs import picture
 from qrl_envs import task as tasks

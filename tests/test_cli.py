@@ -1,0 +1,174 @@
+"""The command line as a user meets it: what it leaves behind, and one clear line for every wrong input."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from qrl.cli import main
+
+TINY = "--steps 400 --lanes 4 --unroll-steps 10 --minibatch-lanes 2 --updates-per-unroll 1 --reports 2 --report-flights 3"
+TINY += " --warmup-unrolls 2 --ring-unrolls 2 --policy-hidden [4] --critic-hidden [4]"
+
+
+def qrl(*words: str | Path) -> int:
+    try:
+        return main([str(word) for word in words])
+    except SystemExit as stop:
+        return int(stop.code or 0)
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
+    """The one line on stderr of a command whose input is wrong."""
+    capsys.readouterr()
+    assert qrl(*words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("qrl: ")
+    assert error.count("\n") == 1
+    return error
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("runs") / "pendulum"
+    assert qrl("train", "pendulum", "--out", out, *TINY.split()) == 0
+    return out
+
+
+def test_training_leaves_the_run_folder(trained: Path) -> None:
+    """DESIGN.md, "Run folder"."""
+    present = {path.name for path in trained.iterdir()}
+    assert {"config.json", "metrics.csv", "checkpoints", "tensorboard", "summary.json"} <= present
+    assert {"learning_curve.png", "flight.png"} <= present
+    header = (trained / "metrics.csv").read_text().splitlines()[0]
+    assert header.startswith("env_steps,updates,return_mean,return_min,success,train_seconds,")
+    config = json.loads((trained / "config.json").read_text())
+    assert config["task"]["spec"]["rod"]["mass_kg"] == 1.0
+    assert config["learner"]["steps"] == 400
+    assert config["versions"]["jax"]
+
+
+def test_config_json_repeats_the_run(trained: Path, tmp_path: Path) -> None:
+    """CONFIG= alone gives the same numbers."""
+    assert qrl("train", "--config", trained / "config.json", "--out", tmp_path / "again") == 0
+    first, again = (json.loads((path / "summary.json").read_text())["result"] for path in (trained, tmp_path / "again"))
+    clocks = {"train_seconds", "steps_per_second"}
+    assert {k: v for k, v in first.items() if k not in clocks} == {k: v for k, v in again.items() if k not in clocks}
+
+
+def test_evaluate_writes_its_table(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert qrl("evaluate", trained, "--starts", "5") == 0
+    result = json.loads((trained / "evaluation.json").read_text())
+    assert result["starts"] == 5
+    assert {"return_mean", "success", "settle_median_s", "settle_p95_s", "rms_angle_rad"} <= set(result)
+    assert "return_mean" in capsys.readouterr().out
+    assert (trained / "evaluation.png").exists()
+
+
+def test_resume_of_a_finished_run_changes_nothing(trained: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in trained.rglob("*")}
+    assert qrl("train", "pendulum", "--out", trained, "--resume") == 0
+    assert {path: path.stat().st_mtime_ns for path in trained.rglob("*")} == before
+
+
+def test_run_that_exists_is_refused(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "holds a run already" in complaint(capsys, "train", "pendulum", "--out", trained)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["hover"], "not the same task"),
+        (["pendulum", "--seed", "3"], "key 'seed' is 0, found 3"),
+        (["pendulum", "--gamma", "0.5"], "key 'learner.gamma' is 0.9"),
+    ],
+)
+def test_resume_of_another_run_is_refused(
+    trained: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    assert says in complaint(capsys, "train", *words, "--out", trained, "--resume")
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["hoverr"], "unknown task 'hoverr' (did you mean 'hover'?)"),
+        (["inverted_pendulun"], "did you mean 'inverted_pendulum'?"),
+        ([], "no task given"),
+        (["nowhere.json"], "nowhere.json: cannot be read"),
+        (["hover", "--stepz", "3"], "unknown flag --stepz (did you mean --steps?)"),
+        (["hover", "--steps", "many"], "command line: key 'steps': expected a valid integer, found \"many\""),
+        (["hover", "--steps", "-5"], "command line: key 'steps': expected greater than or equal to 1, found -5"),
+        (["hover", "--gamma", "1.5"], "key 'gamma': expected less than or equal to 1, found 1.5"),
+        (["hover", "--seed", "x"], "--seed: invalid whole_number value: 'x'"),
+        (["hover", "--form", "quotient"], "key 'form': expected 'ratio' or 'difference', found \"quotient\""),
+        (["hover", "--observation-scale", "[1,2]"], "expected 18 numbers"),
+        (["hover", "--steps", "100"], "expected steps of at least"),
+        (["hover", "--config", "nowhere.json"], "nowhere.json: cannot be read"),
+    ],
+)
+def test_wrong_input_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    """Exit code 2, the flag or file and what was expected; nothing is left behind."""
+    assert says in complaint(capsys, "train", *words, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('{"learner": {"gama": 0.9}}', "learner: unknown key 'gama' (did you mean 'gamma'?)"),
+        ('{"learnr": {}}', "unknown key 'learnr' (did you mean 'learner'?)"),
+        ('{"learner": {"lanes": "four"}}', "key 'lanes': expected a valid integer, found \"four\""),
+        ('{"task": "circle"}', "expected the task asked for, 'hover', found 'circle'"),
+        ('{"seed": -1}', "key 'seed': expected greater than or equal to 0, found -1"),
+        ("[1, 2]", "expected a JSON object, found list"),
+    ],
+)
+def test_wrong_config_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, says: str
+) -> None:
+    """The line names the file."""
+    file = tmp_path / "mine.json"
+    file.write_text(content)
+    line = complaint(capsys, "train", "hover", "--config", file, "--out", tmp_path / "run")
+    assert says in line
+    assert "mine.json" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "not a run folder" in complaint(capsys, "evaluate", tmp_path)
+
+
+def test_foreign_environment_trains(tmp_path: Path) -> None:
+    """Our learner on one of Brax's own environments, which measures no success."""
+    assert qrl("train", "inverted_pendulum", "--out", tmp_path / "run", "--episode-steps", "20", *TINY.split()) == 0
+    rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
+    assert rows[1].split(",")[4] == ""  # success
+    assert not (tmp_path / "run" / "flight.png").exists()
+
+
+def test_interrupted_run_is_saved_and_goes_on(tmp_path: Path) -> None:
+    """Ctrl-C after the first report: exit 1 with the way on; RESUME finishes the run."""
+    out = tmp_path / "run"
+    words = ["train", "pendulum", "--out", str(out), *TINY.split(), "--steps", "2e6", "--reports", "20000"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "qrl", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
+    )
+    assert process.stdout
+    for line in process.stdout:
+        if line.strip()[:1].isdigit():  # the first report
+            process.send_signal(signal.SIGINT)
+            break
+    rest, errors = process.communicate(timeout=120)
+    assert process.returncode == 1, errors
+    assert "stopping" in rest
+    assert "RESUME=1" in rest
+    assert list((out / "checkpoints").iterdir())
+    assert not (out / "summary.json").exists()
