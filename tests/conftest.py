@@ -1,4 +1,4 @@
-"""Every test run compiles each program once: runs of one shape share a compile cache that lives as long as the session."""
+"""Programs of one shape are compiled once in a session: the tests share a compile cache that lives as long."""
 
 import jax
 import pytest

@@ -11,7 +11,9 @@ import pytest
 
 from qrl.cli import main
 
-TINY = "--steps 400 --lanes 4 --unroll-steps 10 --minibatch-lanes 2 --updates-per-unroll 1 --reports 2 --report-flights 3"
+TINY = (
+    "--steps 400 --lanes 4 --unroll-steps 10 --minibatch-lanes 2 --updates-per-unroll 1 --reports 2 --report-flights 3"
+)
 TINY += " --warmup-unrolls 2 --ring-unrolls 2 --policy-hidden [4] --critic-hidden [4]"
 
 

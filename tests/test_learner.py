@@ -7,9 +7,10 @@ import pytest
 
 from qrl import runs
 from qrl.config import Config
-from qrl.learner import Learner
+from qrl.learner import Learner, LearnerState
 from qrl.networks import log_density
 from qrl.types import Transition
+from qrl.vtrace import vtrace
 
 B, T, F, A = 3, 7, 5, 2
 
@@ -95,6 +96,7 @@ def test_update_ascends_both_losses() -> None:
     learner = Learner(config(learning_rate=1e-2, steps=1_000_000), F, A)
     data, update = batch(), jax.jit(learner.update)
     state, first = update(learner.init(jax.random.PRNGKey(1)), data)
+    last = first
     for _ in range(30):
         state, last = update(state, data)
     assert last.policy_loss < first.policy_loss
@@ -121,9 +123,7 @@ def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
     jax.tree.map(lambda g, e: np.testing.assert_allclose(g, e, atol=1e-5), gradient.critic, expected)
 
 
-def _traces(learner: Learner, state: object, data: Transition) -> tuple[jax.Array, jax.Array]:
-    from qrl.vtrace import vtrace
-
+def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[jax.Array, jax.Array]:
     c = learner.config
     value = learner.critic.apply(state.params.critic, data.observation)[..., 0]
     after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]

@@ -37,10 +37,14 @@ def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def run_config(seed: int = 0, seeds: int = 1, **changes: object) -> RunConfig:
     learner = Config.model_validate(runs.preset("default") | SMALL | changes, strict=False)
-    return RunConfig(task=TaskRecord(name="pendulum", spec=None), learner=learner, seed=seed, seeds=seeds, versions={}, devices=[])
+    return RunConfig(
+        task=TaskRecord(name="pendulum", spec=None), learner=learner, seed=seed, seeds=seeds, versions={}, devices=[]
+    )
 
 
-def train(out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_after: int | None = None) -> list[loop.Event]:
+def train(
+    out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_after: int | None = None
+) -> list[loop.Event]:
     """Run to the end, or until `stop_after` events beyond compilation."""
     for folder in runs.members(out, run):
         folder.mkdir(parents=True, exist_ok=True)
@@ -57,7 +61,10 @@ def train(out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_aft
 def metrics(folder: Path) -> list[dict[str, str]]:
     """metrics.csv without its clocks."""
     with (folder / "metrics.csv").open() as file:
-        return [{k: v for k, v in row.items() if not k.endswith(("train_seconds", "_per_second"))} for row in csv.DictReader(file)]
+        return [
+            {k: v for k, v in row.items() if not k.endswith(("train_seconds", "_per_second"))}
+            for row in csv.DictReader(file)
+        ]
 
 
 def last_state(folder: Path, run: RunConfig, env: Env) -> list[np.ndarray]:
@@ -148,7 +155,9 @@ def test_nan_stops_the_run_and_keeps_the_last_good_checkpoint(tmp_path: Path) ->
 
 def test_fault_in_the_learner_is_named(tmp_path: Path, pendulum: Env) -> None:
     """A step size that blows the networks up is found in the learner's own terms, not in the world."""
-    with pytest.raises(loop.NotFinite, match=r"(log_rho|value|a_trace|_loss|_gradient|reward|observation) is not finite"):
+    with pytest.raises(
+        loop.NotFinite, match=r"(log_rho|value|a_trace|_loss|_gradient|reward|observation) is not finite"
+    ):
         train(tmp_path, run_config(learning_rate=1e30, learning_rate_end=1e30), pendulum)
 
 
@@ -160,5 +169,3 @@ def test_no_checkpoint_is_said(tmp_path: Path, pendulum: Env) -> None:
 def test_stop_before_the_first_step_saves_nothing(tmp_path: Path, pendulum: Env) -> None:
     train(tmp_path, run_config(), pendulum, stop_after=0)
     assert runs.read_metrics(tmp_path) == []
-
-

@@ -126,9 +126,7 @@ class QuadrotorEnv(TaskEnv):
     def _draw(self, params: Params, rng: chex.PRNGKey) -> quadrotor.Body:
         return quadrotor.draw(params.start, rng)
 
-    def _advance(
-        self, params: Params, x: quadrotor.Body, action: chex.Array
-    ) -> tuple[quadrotor.Body, chex.Array]:
+    def _advance(self, params: Params, x: quadrotor.Body, action: chex.Array) -> tuple[quadrotor.Body, chex.Array]:
         thrust = quadrotor.thrust_N(params.physics, action)
         body = quadrotor.step(params.physics, x, thrust, self.task.control_period_s)
         return body, params.reward(body, quadrotor.applied_action(params.physics, thrust))
@@ -193,5 +191,3 @@ def from_task(task: Task) -> TaskEnv:
 def make(name_or_path: str) -> TaskEnv:
     """The Brax environment of a shipped task's name or of a task file; BadInput if there is none."""
     return from_task(tasks.load(name_or_path))
-
-

@@ -51,7 +51,7 @@ def settle_s(within: chex.Array, dt_s: float) -> chex.Array:
 
 
 def summarise(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Array]:
-    """{"success": 0 or 1, "settle_s", "rms_<error>"…} of one flight; the tail is its last `tail_steps` control periods."""
+    """{"success": 0 or 1, "settle_s", "rms_<error>"…} of one flight; its tail is the last `tail_steps` periods."""
     tail = {name: error[-(tail_steps + 1) :] for name, error in flight.errors.items()}
     rms = {f"rms_{name}": jnp.sqrt(jnp.mean(error**2)) for name, error in tail.items()}
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(error)) for error in flight.errors.values()]))

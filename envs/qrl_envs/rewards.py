@@ -53,9 +53,7 @@ class Circle(NamedTuple):
         d = jnp.hypot(jnp.hypot(x, y) - self.radius_m, z)
         chi = x * vy - y * vx - self.radius_m * self.speed_m_s
         return self.constant - (
-            self.w4_distance_1_m * d
-            + self.w5_direction_s_m2 * jnp.abs(chi)
-            + self.w6_action * jnp.linalg.norm(action)
+            self.w4_distance_1_m * d + self.w5_direction_s_m2 * jnp.abs(chi) + self.w6_action * jnp.linalg.norm(action)
         )
 
 
@@ -69,9 +67,7 @@ class SwingUp(NamedTuple):
     def __call__(self, x: Pendulum, torque: chex.Array) -> chex.Array:
         """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²), θ wrapped to ±π, on the state before the step."""
         theta = jnp.mod(x.pose + jnp.pi, 2.0 * jnp.pi) - jnp.pi
-        return -(
-            self.w_angle_1_rad2 * theta**2 + self.w_rate_s2_rad2 * x.twist**2 + self.w_torque_1_N2m2 * torque**2
-        )
+        return -(self.w_angle_1_rad2 * theta**2 + self.w_rate_s2_rad2 * x.twist**2 + self.w_torque_1_N2m2 * torque**2)
 
 
 _FORMS = {"hover": Hover, "circle": Circle, "pendulum": SwingUp}

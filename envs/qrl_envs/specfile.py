@@ -73,8 +73,10 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in over.items():
         old = base.get(key)
-        both = isinstance(value, dict) and isinstance(old, dict)
-        merged[key] = merge(old, value) if both and value.get("form") in (None, old.get("form")) else value
+        if isinstance(value, dict) and isinstance(old, dict) and value.get("form") in (None, old.get("form")):
+            merged[key] = merge(old, value)
+        else:
+            merged[key] = value
     return merged
 
 

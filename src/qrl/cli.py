@@ -18,13 +18,17 @@ class _Parser(argparse.ArgumentParser):
     """argparse with one-line errors."""
 
     def error(self, message: str) -> NoReturn:
-        unknown = message.removeprefix("unrecognized arguments: ").split()[0].split("=")[0]
-        if message.startswith("unrecognized arguments: --"):
-            flags = [flag for action in self._actions for flag in action.option_strings]
-            close = difflib.get_close_matches(unknown, flags, n=1)
-            message = f"unknown flag {unknown} " + (f"(did you mean {close[0]}?)" if close else f"(see {self.prog} --help)")
         complain(message)
         sys.exit(WRONG_INPUT)
+
+    def refuse(self, word: str) -> NoReturn:
+        """`word` is neither a flag nor an argument of this command."""
+        flags = [flag for action in self._actions for flag in action.option_strings]
+        close = difflib.get_close_matches(word.split("=")[0], flags, n=1) if word.startswith("-") else []
+        self.error(
+            f"unknown {'flag' if word.startswith('-') else 'argument'} {word}"
+            f" ({f'did you mean {close[0]}?' if close else f'see {self.prog} --help'})"
+        )
 
 
 def whole_number(text: str) -> int:
@@ -41,7 +45,7 @@ def count(text: str) -> int:
     return value
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser = _Parser(prog="qrl", description="From a vehicle and a task to a policy that flies.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
@@ -62,7 +66,10 @@ def _parser() -> argparse.ArgumentParser:
     evaluate.add_argument("--starts", type=count, default=1000, help="how many starts (1000)", metavar="N")
 
     commands.add_parser("tasks", help="list the tasks that can be trained", allow_abbrev=False)
-    return parser
+    args, unknown = parser.parse_known_args(argv)
+    if unknown:
+        commands.choices[args.command].refuse(unknown[0])
+    return args
 
 
 def _load() -> None:
@@ -81,7 +88,7 @@ def _load() -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns DESIGN.md's exit code: 0 done, 1 failed while running, 2 the input was wrong."""
-    args = _parser().parse_args(argv)
+    args = _parse(argv)
     if args.command == "train":
         print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
     try:

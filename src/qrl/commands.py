@@ -74,10 +74,8 @@ def train(args: argparse.Namespace) -> int:
     env = request.environment(config.task)
     request.check(env, config.learner)
     _prepare(out, config, held)
-    console.print(
-        f"{config.task.name}: {config.learner.steps:,} steps, "
-        f"{'seed' if config.seeds == 1 else f'{config.seeds} seeds from'} {config.seed}, on {jax.devices()[0].platform} -> {out}"
-    )
+    seeds = f"seed {config.seed}" if config.seeds == 1 else f"{config.seeds} seeds from {config.seed}"
+    console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {config.devices[0]} -> {out}")
     with _stop_requested() as stopped:
         flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
         if stopped():

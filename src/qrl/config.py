@@ -55,9 +55,7 @@ class Config(BaseModel):
     advantage: Literal["pi", "mu"] = Field(
         description="pi: A^pi by V-trace (conditions 3, 4); mu: A^mu by GAE(lambda) (conditions 1, 2)"
     )
-    form: Literal["ratio", "difference"] = Field(
-        description="pi/mu − 1 (conditions 2, 4) or pi − mu (conditions 1, 3)"
-    )
+    form: Literal["ratio", "difference"] = Field(description="pi/mu − 1 (conditions 2, 4) or pi − mu (conditions 1, 3)")
     epsilon: Positive = Field(description="margin epsilon·|A|")
     xi: Positive | None = Field(description="constant margin in its stead; null: none")
     normalise_advantage: bool = Field(description="divide A by its root mean square over the minibatch")

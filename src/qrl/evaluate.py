@@ -34,15 +34,11 @@ def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, 
         after = jax.vmap(env.step)(state, action)
         over = state.done.astype(bool)
         total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)
-        held = jax.tree.map(
-            lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state
-        )
+        held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
         return (held, total), (state.obs, action)
 
     state = jax.vmap(env.reset)(keys)
-    (state, returns), (observations, actions) = jax.lax.scan(
-        step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps)
-    )
+    (state, returns), (observations, actions) = jax.lax.scan(step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps))
     observations = jnp.concatenate([observations, state.obs[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
     return Flights(returns, measures, observations, actions.swapaxes(0, 1))

@@ -80,7 +80,7 @@ class Learner:
 
     def mean(self, state: LearnerState, observation: chex.Array) -> chex.Array:
         """The policy's mean action; [..., F] -> [..., A]."""
-        return self.policy.apply(state.params.policy, self.scale(state, observation))
+        return _apply(self.policy, state.params.policy, self.scale(state, observation))
 
     def shipped(self, state: LearnerState) -> LearnerState:
         """The learner with the policy that ships: the average, where averaging is on and has begun."""
@@ -94,7 +94,9 @@ class Learner:
         """Take observations [..., F] into the running statistics, where they are used."""
         if not self.config.normalise_observations:
             return state
-        return state._replace(statistics=statistics.update(state.statistics, observation.reshape(-1, self.observation_size)))
+        return state._replace(
+            statistics=statistics.update(state.statistics, observation.reshape(-1, self.observation_size))
+        )
 
     def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
         """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""
@@ -126,9 +128,9 @@ class Learner:
 
         observation = self.scale(state, flat(batch.observation))
         next_observation = self.scale(state, flat(batch.next_observation))
-        value = self.critic.apply(params.critic, observation).reshape(samples)
-        next_value = jax.lax.stop_gradient(self.critic.apply(params.critic, next_observation)).reshape(samples)
-        mean = self.policy.apply(params.policy, observation)
+        value = _apply(self.critic, params.critic, observation).reshape(samples)
+        next_value = jax.lax.stop_gradient(_apply(self.critic, params.critic, next_observation)).reshape(samples)
+        mean = _apply(self.policy, params.policy, observation)
         log_pi = log_density(flat(batch.action), mean, self.sigma(state)).reshape(samples)
         log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
 
@@ -174,3 +176,7 @@ class Learner:
         weight = 1.0 / jnp.maximum(self._averaging(state), 1)
         average = jax.tree.map(lambda a, p: a + weight * (p - a), state.average, state.params.policy)
         return state._replace(average=average)
+
+
+def _apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:
+    return jnp.asarray(network.apply(params, x))  # flax types its result as a union

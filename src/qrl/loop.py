@@ -68,7 +68,7 @@ class Member:
         runs.write_metrics(self.folder, self.rows)
         for name, value in row.items():
             if name != "env_steps" and np.isfinite(value):
-                self.writer.add_scalar(name, value, row["env_steps"])
+                self.writer.add_scalar(name, value, int(row["env_steps"]))
         self.writer.flush()
 
 
@@ -124,21 +124,19 @@ def _advance_and_report(
         chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))
         speed = (until - done) * config.unroll_size * run.seeds / lap
         done = until
-        if done == report_at:
-            flights = fly(states)
-            rows = _rows(config, states, flights, clock, since_report)
-            states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
-            since_report = 0.0
-            # The checkpoint first: after a kill between the two, a row is made again, never missing.
-            _save(states, members, done * config.unroll_size)
-            for member, row in zip(members, rows, strict=True):
-                member.record(row)
         left = (time.perf_counter() - began) / (done - first) * (config.unrolls - done)
-        yield (
-            Reported(rows, flights, left)
-            if done == report_at
-            else Progress(done * config.unroll_size, speed, left)
-        )
+        if done < report_at:
+            yield Progress(done * config.unroll_size, speed, left)
+            continue
+        flights = fly(states)
+        rows = _rows(config, states, flights, clock, since_report)
+        states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
+        since_report = 0.0
+        # The checkpoint first: after a kill between the two, a row would otherwise stand without its state.
+        _save(states, members, done * config.unroll_size)
+        for member, row in zip(members, rows, strict=True):
+            member.record(row)
+        yield Reported(rows, flights, left)
     if done % config.unrolls_per_report and done < config.unrolls and done > first:
         _save(states, members, done * config.unroll_size)
 

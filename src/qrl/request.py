@@ -72,10 +72,9 @@ def check(env: Env, learner: Config) -> None:
     size = env.observation_size
     if not isinstance(size, int):
         raise BadInput("this environment's observation is not one flat vector, which is all that qrl trains on")
-    if learner.observation_scale and len(learner.observation_scale) != size:
-        raise BadInput(
-            f"key 'observation_scale': expected {size} numbers, one for each observation, found {len(learner.observation_scale)}"
-        )
+    given = len(learner.observation_scale or ())
+    if given not in (0, size):
+        raise BadInput(f"key 'observation_scale': expected {size} numbers, one for each observation, found {given}")
 
 
 def stored(folder: Path) -> RunConfig:
@@ -96,8 +95,7 @@ def resumed(folder: Path, asked: RunConfig, given: dict[str, Any], seed: int | N
         if wanted is not None and wanted != found:
             raise BadInput(f"{wrong} key '{name}' is {found}, found {wanted} on the command line")
     for name in given:
-        if getattr(run.learner, name) != getattr(asked.learner, name):
-            raise BadInput(
-                f"{wrong} key 'learner.{name}' is {getattr(run.learner, name)}, asked for {getattr(asked.learner, name)}"
-            )
+        found, wanted = getattr(run.learner, name), getattr(asked.learner, name)
+        if found != wanted:
+            raise BadInput(f"{wrong} key 'learner.{name}' is {found}, asked for {wanted}")
     return run

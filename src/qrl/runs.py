@@ -1,9 +1,8 @@
-"""The run folder: what was asked (config.json), what happened (metrics.csv, TensorBoard), what came out (summary.json)."""
+"""The run folder's files: what was asked (config.json) and what happened (metrics.csv)."""
 
 import csv
 import json
 import math
-import os
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any, Literal
@@ -84,7 +83,7 @@ def write_json(path: Path, data: Any) -> None:
     """Write `data` whole or not at all."""
     temporary = path.with_name(path.name + ".tmp")
     temporary.write_text(json.dumps(_plain(data), indent=2) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    temporary.replace(path)
 
 
 def _plain(data: Any) -> Any:
@@ -106,7 +105,11 @@ def read_metrics(folder: Path) -> list[Row]:
         return []
     with path.open(newline="", encoding="utf-8") as file:
         return [
-            {key: float(cell) if "." in cell or "n" in cell or "e" in cell else int(cell) for key, cell in row.items() if cell}
+            {
+                key: float(cell) if "." in cell or "n" in cell or "e" in cell else int(cell)
+                for key, cell in row.items()
+                if cell
+            }
             for row in csv.DictReader(file)
         ]
 
@@ -118,6 +121,7 @@ def write_metrics(folder: Path, rows: list[Row]) -> None:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(
-            {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()} for row in rows
+            {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+            for row in rows
         )
-    os.replace(temporary, folder / "metrics.csv")
+    temporary.replace(folder / "metrics.csv")
