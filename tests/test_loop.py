@@ -108,7 +108,7 @@ def test_resumed_run_equals_one_never_stopped(tmp_path: Path, pendulum: Env, who
 
 
 def test_rows_after_the_checkpoint_are_cut(tmp_path: Path, pendulum: Env, whole: Path) -> None:
-    """Killed before the last checkpoint was made: its row is made again, once."""
+    """Killed before the last checkpoint was made: its row is made again, once, and the run then ends."""
     train(tmp_path, run_config(), pendulum)
     with checkpoint.manager(tmp_path) as saved:
         saved.delete(1200)
@@ -159,6 +159,15 @@ def test_fault_in_the_learner_is_named(tmp_path: Path, pendulum: Env) -> None:
         loop.NotFinite, match=r"(log_rho|value|a_trace|_loss|_gradient|reward|observation) is not finite"
     ):
         train(tmp_path, run_config(learning_rate=1e30, learning_rate_end=1e30), pendulum)
+
+
+def test_row_without_its_checkpoint_is_cut_and_made_again(tmp_path: Path, pendulum: Env, whole: Path) -> None:
+    """Killed between the row and the checkpoint of a report: the resumed run has every row, once."""
+    train(tmp_path, run_config(), pendulum, stop_after=8)
+    rows = runs.read_metrics(tmp_path)
+    runs.write_metrics(tmp_path, [*rows, {**rows[-1], "env_steps": rows[-1]["env_steps"] + 200}])
+    train(tmp_path, run_config(), pendulum, resume=True)
+    assert metrics(tmp_path) == metrics(whole)
 
 
 def test_no_checkpoint_is_said(tmp_path: Path, pendulum: Env) -> None:

@@ -8,11 +8,14 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
 
 class BadInput(ValueError):
     """The user's input is wrong. The message is one line: where, which key, what was expected."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(message.split()))  # keys and values may hold line breaks of their own
 
 
 class Spec(BaseModel):
@@ -25,10 +28,15 @@ def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Count = Annotated[int, BeforeValidator(_whole), Field(ge=1)]  # accepts 2e6
+def _single(value: float) -> float:
+    if value and not 1e-30 <= abs(value) <= 1e30:
+        raise ValueError(f"expected a magnitude that single precision holds (1e-30 to 1e30), found {value}")
+    return value
+
+
+Positive = Annotated[float, Field(gt=0), AfterValidator(_single)]
+NonNegative = Annotated[float, Field(ge=0), AfterValidator(_single)]
+Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, lt=2**31)]  # accepts 2e6
 
 T = TypeVar("T")
 
@@ -58,8 +66,10 @@ def read(path: Path) -> dict[str, Any]:
         raise BadInput(f"{path}: cannot be read ({error.strerror})") from None
     except json.JSONDecodeError as error:
         raise BadInput(f"{path}: line {error.lineno}, column {error.colno}: not JSON ({error.msg})") from None
-    except (UnicodeDecodeError, RecursionError):
-        raise BadInput(f"{path}: not JSON text") from None
+    except BadInput:
+        raise
+    except (ValueError, RecursionError):  # not UTF-8, a number of thousands of digits, nested without end
+        raise BadInput(f"{path}: not JSON that can be read") from None
     if not isinstance(data, dict):
         raise BadInput(f"{path}: expected a JSON object, found {type(data).__name__}")
     return data

@@ -6,7 +6,7 @@ DESIGN.md's (world and body: x forward, y left, z up).
 
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
@@ -101,11 +101,21 @@ class FlightEvaluation(Spec):
 
     @model_validator(mode="after")
     def _consistent(self) -> "FlightEvaluation":
-        if self.tail_s > self.duration_s:
-            raise ValueError(f"expected tail_s of at most duration_s ({self.duration_s}), found {self.tail_s}")
         if (self.speed_m_s is None) != (self.reward.form == "hover"):
             raise ValueError("expected speed_m_s for the circle and for the circle alone")
         return self
+
+
+T = TypeVar("T", bound="QuadrotorTask | PendulumTask")
+
+
+def _periods_fit(task: T) -> T:
+    if not task.control_period_s <= task.evaluation.tail_s <= task.evaluation.duration_s:
+        raise ValueError(
+            "expected control_period_s ≤ evaluation.tail_s ≤ evaluation.duration_s, found "
+            f"{task.control_period_s}, {task.evaluation.tail_s}, {task.evaluation.duration_s}"
+        )
+    return task
 
 
 class QuadrotorTask(Spec):
@@ -124,7 +134,7 @@ class QuadrotorTask(Spec):
     def _consistent(self) -> "QuadrotorTask":
         if self.reward.form != self.evaluation.reward.form:
             raise ValueError("expected reward.form and evaluation.reward.form to be the same")
-        return self
+        return _periods_fit(self)
 
 
 class PendulumStart(Spec):
@@ -168,6 +178,10 @@ class PendulumTask(Spec):
     start: PendulumStart
     reward: PendulumReward
     evaluation: PendulumEvaluation
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "PendulumTask":
+        return _periods_fit(self)
 
 
 Task = QuadrotorTask | PendulumTask

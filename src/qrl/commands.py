@@ -78,7 +78,7 @@ def train(args: argparse.Namespace) -> int:
     console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {config.devices[0]} -> {out}")
     with _stop_requested() as stopped:
         flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
-        if stopped():
+        if flights is None:
             console.print(f"stopped, all saved; to go on: make train TASK={args.task or ''} OUT={out} RESUME=1")
             return FAILED
     _finish(out, config, flights, time.perf_counter() - begun)
@@ -127,7 +127,7 @@ def _stop_requested() -> Iterator[Callable[[], bool]]:
 
 
 def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
-    """Show what happens, a line a report; returns the last report's flights."""
+    """Show what happens, a line a report; returns the flights of a run that came to its end."""
     flights, started = None, time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
@@ -143,8 +143,9 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
             elif isinstance(event, loop.Progress):
                 note = f"{event.steps_per_second:,.0f} steps/s, {_clock(event.seconds_left)} left"
                 bar.update(task, completed=event.env_steps, note=note)
-            else:
+            elif isinstance(event, loop.Finished):
                 flights = event.flights
+            else:
                 bar.update(task, completed=event.rows[0]["env_steps"])
                 console.print(_line(event.rows, event.seconds_left))
     return flights
@@ -176,14 +177,14 @@ def _clock(seconds: float) -> str:
     return f"{minutes}:{seconds:02d}"
 
 
-def _finish(out: Path, config: RunConfig, flights: Flights | None, seconds: float) -> None:
+def _finish(out: Path, config: RunConfig, flights: Flights, seconds: float) -> None:
     """Pictures, then summary.json of each seed, then that of the whole."""
     folders = runs.members(out, config)
     history = [runs.read_metrics(folder) for folder in folders]
     for i, folder in enumerate(folders):
         title = f"{config.task.name}, seed {config.seed + i}"
         plots.learning_curve(folder / "learning_curve.png", [history[i]], title)
-        if flights is not None and config.task.spec:
+        if config.task.spec:
             shown = np.asarray(flights.observations[i, :PICTURE_FLIGHTS])
             picture.flights(folder / "flight.png", _task(config), shown)
         runs.write_json(folder / "summary.json", {"result": history[i][-1], "command_seconds": round(seconds, 1)})

@@ -47,11 +47,17 @@ class Reported:
     """A report was made, recorded and saved."""
 
     rows: list[Row]  # one for each seed
-    flights: Flights  # leading axis: seeds
     seconds_left: float
 
 
-Event = Compiling | Progress | Reported
+@dataclass(frozen=True)
+class Finished:
+    """All steps are made; the policies that ship, flown once more from the reports' starts."""
+
+    flights: Flights  # leading axis: seeds
+
+
+Event = Compiling | Progress | Reported | Finished
 
 
 @dataclass
@@ -132,12 +138,14 @@ def _advance_and_report(
         rows = _rows(config, states, flights, clock, since_report)
         states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
         since_report = 0.0
-        # The checkpoint first: after a kill between the two, a row would otherwise stand without its state.
-        _save(states, members, done * config.unroll_size)
+        # The row first: killed between the two, a resumed run cuts it and makes it again.
         for member, row in zip(members, rows, strict=True):
             member.record(row)
-        yield Reported(rows, flights, left)
-    if done % config.unrolls_per_report and done < config.unrolls and done > first:
+        _save(states, members, done * config.unroll_size)
+        yield Reported(rows, left)
+    if done == config.unrolls:
+        yield Finished(fly(states))
+    elif done > first and done % config.unrolls_per_report:
         _save(states, members, done * config.unroll_size)
 
 
