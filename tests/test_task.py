@@ -103,6 +103,12 @@ def test_counts_may_be_written_with_an_exponent(path: Path) -> None:
     assert load(path, hover('"episode_steps": 2e2')).episode_steps == 200
 
 
+def test_a_flat_plate_is_a_body(path: Path) -> None:
+    """Where one moment is the sum of the other two, however the sum rounds."""
+    for x, y, z in [(0.1, 0.2, 0.3), (0.0001, 0.0003, 0.0004), (0.0022, 0.0001, 0.0021)]:
+        load(path, hover(f'"vehicle": {{"inertia_kg_m2": [{x}, {y}, {z}]}}'))
+
+
 # What is wrong -> the file, and the words that its one line must hold.
 MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
     "negative mass": (hover('"vehicle": {"mass_kg": -0.5}'), ["'vehicle.mass_kg'", "greater than 0", "-0.5"]),
@@ -190,6 +196,11 @@ MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
     # Numbers that the world's float32, or its step counters, cannot hold.
     "mass that rounds to zero": (hover('"vehicle": {"mass_kg": 1e-60}'), ["mass_kg"]),
     "inertia that rounds to zero": (hover('"vehicle": {"inertia_kg_m2": [1e-60, 1e-60, 1e-60]}'), ["inertia_kg_m2"]),
+    "motor beyond single precision": (
+        hover('"vehicle": {"motors": %s}' % motors().replace("[0.1, 0.1]", "[1e39, 0.1]")),  # noqa: UP031
+        ["position_m", "1e+39"],
+    ),
+    "constant beyond single precision": (hover('"reward": {"constant": -1e39}'), ["'reward.constant'", "-1e+39"]),
     "endless episode": (hover('"episode_steps": 1e300'), ["episode_steps"]),
     "period longer than the flight": (hover('"control_period_s": 20'), ["control_period_s"]),
 }
