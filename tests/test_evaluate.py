@@ -122,19 +122,23 @@ def test_return_counts_the_first_return_steps_alone(judged: Flights) -> None:
     np.testing.assert_array_equal(judged.returns, last * (last + 1) / 2)
 
 
-def test_a_flight_stays_where_it_ended(plain: Flights) -> None:
-    """Observations count up to the end and are constant from there; K steps have K + 1 of them."""
+def seen(flights: Flights, steps: int) -> Array:
+    """The time that an observation shows: it counts up, and is NaN from where the episode ended."""
+    t = np.arange(steps + 1)
+    return np.where(t < lives(flights)[:, None], t, np.nan)
+
+
+def test_nothing_is_observed_from_where_a_flight_ended(plain: Flights) -> None:
+    """So that no measure can take where it ended for a success; K steps have K + 1 observations."""
     assert plain.observations.shape == (N, LONGEST + 1, 3)
-    expected = np.minimum(np.arange(LONGEST + 1), lives(plain)[:, None])
-    np.testing.assert_array_equal(plain.observations[..., TIME], expected)
-    assert np.isfinite(plain.observations).all()
+    np.testing.assert_array_equal(plain.observations[..., TIME], seen(plain, LONGEST))
 
 
 def test_measures_see_the_whole_flight(judged: Flights) -> None:
-    """From the start to 9 steps later, frozen where it ended."""
+    """From the start to 9 steps later."""
     assert judged.observations.shape == (N, 10, 3)
-    times = np.minimum(np.arange(10), lives(judged)[:, None])
     assert judged.measures.keys() == {"last", "sum"}
+    times = seen(judged, 9)
     np.testing.assert_array_equal(judged.measures["last"], times[:, -1])
     np.testing.assert_array_equal(judged.measures["sum"], times.sum(axis=1))
 
@@ -150,12 +154,12 @@ def test_an_environment_without_measures_has_its_return_alone(plain: Flights) ->
 def test_actions_are_the_policys_mean_clipped(plain: Flights) -> None:
     """To [−1, 1], as recorded and as flown."""
     assert plain.actions.shape == (N, LONGEST, 2)
-    times = plain.observations[:, :-1, TIME]
-    np.testing.assert_array_equal(plain.actions[..., 0], np.clip(times - 2.5, -1.0, 1.0))
-    np.testing.assert_array_equal(plain.actions[..., 1], -1.0)
-    flying = times < lives(plain)[:, None]
+    flying = np.isfinite(plain.observations[:, 1:, TIME])
+    wanted = np.clip(np.arange(LONGEST) - 2.5, -1.0, 1.0) + np.zeros((N, 1))
+    np.testing.assert_array_equal(plain.actions[..., 0][flying], wanted[flying])
+    np.testing.assert_array_equal(plain.actions[..., 1][flying], -1.0)
     moved = np.diff(plain.observations[..., MOVED], axis=1)
-    np.testing.assert_allclose(moved, np.where(flying, plain.actions[..., 0], 0.0), atol=1e-6)
+    np.testing.assert_allclose(moved[flying], plain.actions[..., 0][flying], atol=1e-6)
 
 
 def test_flights_are_deterministic_and_each_its_keys_own(plain: Flights) -> None:
@@ -168,7 +172,7 @@ def test_flights_are_deterministic_and_each_its_keys_own(plain: Flights) -> None
 
 
 def test_a_flight_that_ends_early_is_no_success() -> None:
-    """Though it ends, and so stays, at the very hover point: a vehicle that tumbles there beyond the bounds fails."""
+    """Though it ends at the very hover point: a vehicle that tumbles there beyond the bounds fails."""
     flights = jax.jit(lambda k: evaluate.fly(Still(), lambda o: jnp.zeros((*o.shape[:-1], 4)), k, 200))(keys(2))
     np.testing.assert_array_equal(flights.measures["success"], 0.0)
     assert np.isposinf(flights.measures["settle_s"]).all()

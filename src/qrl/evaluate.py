@@ -7,7 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env
+from brax.envs.base import Env, State
 
 
 class Flights(NamedTuple):
@@ -15,7 +15,7 @@ class Flights(NamedTuple):
 
     returns: chex.Array  # [n] sum of the first `return_steps` rewards, up to the episode's end
     measures: dict[str, chex.Array]  # name -> [n]; empty where the environment measures nothing
-    observations: chex.Array  # [n, steps + 1, F]; constant after the episode's end
+    observations: chex.Array  # [n, steps + 1, F]; NaN from where an episode ended early
     actions: chex.Array  # [n, steps, A] clipped to [−1, 1]
 
 
@@ -23,7 +23,8 @@ def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, 
     """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
 
     `env` is the training environment; one with an `evaluation` (ours) is flown and measured as that says,
-    another for one episode of `longest` steps. A flight that ends early stays where it ended.
+    another for one episode of `longest` steps. A flight that ends early has nothing more to observe: its
+    NaNs make it a failure wherever it ended.
     """
     plan = getattr(env, "evaluation", lambda: None)()
     env, steps, return_steps, measure = plan or (env, longest, longest, None)
@@ -35,13 +36,17 @@ def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, 
         over = state.done.astype(bool)
         total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
-        return (held, total), (state.obs, action)
+        return (held, total), (_seen(state), action)
 
     state = jax.vmap(env.reset)(keys)
     (state, returns), (observations, actions) = jax.lax.scan(step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps))
-    observations = jnp.concatenate([observations, state.obs[None]]).swapaxes(0, 1)
+    observations = jnp.concatenate([observations, _seen(state)[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
     return Flights(returns, measures, observations, actions.swapaxes(0, 1))
+
+
+def _seen(state: State) -> chex.Array:
+    return jnp.where(state.done.astype(bool)[:, None], jnp.nan, state.obs)
 
 
 def summarise(flights: Flights) -> dict[str, float]:
