@@ -1,7 +1,7 @@
 """How well a flight went: success, settle time, steady-state errors (DESIGN.md, "Evaluation").
 
-For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps. A comparison with a NaN
-is false, so a flight with a number that is not finite is never a success.
+For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps. A flight with a number
+that is not finite, in any observation, is a failure.
 """
 
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from qrl_envs.task import FlightEvaluation, PendulumEvaluation
 class Errors(NamedTuple):
     """Steady-state errors of one flight, by name, and where each sample is within the tolerances."""
 
+    finite: chex.Array  # [] bool: every observation of the flight is
     within: chex.Array  # [K + 1] bool
     errors: dict[str, chex.Array]  # name with unit -> [K + 1]
 
@@ -22,7 +23,7 @@ class Errors(NamedTuple):
 def hover(observations: chex.Array, tolerance: FlightEvaluation) -> Errors:
     """Distance from the hover point [m]."""
     distance = jnp.linalg.norm(observations[:, 9:12], axis=-1)
-    return Errors(distance < tolerance.distance_m, {"position_m": distance})
+    return Errors(_finite(observations), distance < tolerance.distance_m, {"position_m": distance})
 
 
 def circle(observations: chex.Array, tolerance: FlightEvaluation, radius_m: float, speed_m_s: float) -> Errors:
@@ -32,14 +33,18 @@ def circle(observations: chex.Array, tolerance: FlightEvaluation, radius_m: floa
     speed = (x * vy - y * vx) / r - speed_m_s
     assert tolerance.speed_m_s is not None  # the task file's validator saw to it
     within = (jnp.hypot(r - radius_m, z) < tolerance.distance_m) & (jnp.abs(speed) < tolerance.speed_m_s)
-    return Errors(within, {"radius_m": r - radius_m, "height_m": z, "speed_m_s": speed})
+    return Errors(_finite(observations), within, {"radius_m": r - radius_m, "height_m": z, "speed_m_s": speed})
 
 
 def pendulum(observations: chex.Array, tolerance: PendulumEvaluation) -> Errors:
     """Angle from upright [rad] and rate [rad/s]."""
     theta, rate = jnp.arctan2(observations[:, 1], observations[:, 0]), observations[:, 2]
     within = (jnp.abs(theta) < tolerance.angle_rad) & (jnp.abs(rate) < tolerance.rate_rad_s)
-    return Errors(within, {"angle_rad": theta})
+    return Errors(_finite(observations), within, {"angle_rad": theta})
+
+
+def _finite(observations: chex.Array) -> chex.Array:
+    return jnp.all(jnp.isfinite(observations))
 
 
 def settle_s(within: chex.Array, dt_s: float) -> chex.Array:
@@ -54,9 +59,8 @@ def summarise(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Ar
     """{"success": 0 or 1, "settle_s", "rms_<error>"…} of one flight; its tail is the last `tail_steps` periods."""
     tail = {name: error[-(tail_steps + 1) :] for name, error in flight.errors.items()}
     rms = {f"rms_{name}": jnp.sqrt(jnp.mean(error**2)) for name, error in tail.items()}
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(error)) for error in flight.errors.values()]))
     return {
-        "success": (finite & jnp.all(flight.within[-(tail_steps + 1) :])).astype(jnp.float32),
-        "settle_s": jnp.where(finite, settle_s(flight.within, dt_s), jnp.inf),
+        "success": (flight.finite & jnp.all(flight.within[-(tail_steps + 1) :])).astype(jnp.float32),
+        "settle_s": jnp.where(flight.finite, settle_s(flight.within, dt_s), jnp.inf),
         **{name: jnp.where(jnp.isfinite(value), value, jnp.inf) for name, value in rms.items()},
     }

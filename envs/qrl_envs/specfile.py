@@ -34,6 +34,7 @@ def _single(value: float) -> float:
     return value
 
 
+Real = Annotated[float, AfterValidator(_single)]
 Positive = Annotated[float, Field(gt=0), AfterValidator(_single)]
 NonNegative = Annotated[float, Field(ge=0), AfterValidator(_single)]
 Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, lt=2**31)]  # accepts 2e6
@@ -57,11 +58,8 @@ def read(path: Path) -> dict[str, Any]:
                 raise BadInput(f"{path}: key '{key}' stands twice")
         return dict(pairs)
 
-    def finite(token: str) -> float:
-        raise BadInput(f"{path}: {token} is not a number")
-
     try:
-        data = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique, parse_constant=finite)
+        data = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique)
     except OSError as error:
         raise BadInput(f"{path}: cannot be read ({error.strerror})") from None
     except json.JSONDecodeError as error:

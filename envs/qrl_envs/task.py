@@ -11,11 +11,11 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.specfile import BadInput, Count, NonNegative, Positive, Spec
+from qrl_envs.specfile import BadInput, Count, NonNegative, Positive, Real, Spec
 
 
 class Motor(Spec):
-    position_m: tuple[float, float]  # x, y in the body frame
+    position_m: tuple[Real, Real]  # x, y in the body frame
     spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about body z
     max_N: Positive
 
@@ -68,7 +68,7 @@ class HoverReward(Spec):
     """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖), the paper's form."""
 
     form: Literal["hover"]
-    constant: float = 0.0
+    constant: Real = 0.0
     w1_attitude: NonNegative
     w2_position_1_m: NonNegative
     w3_action: NonNegative
@@ -78,7 +78,7 @@ class CircleReward(Spec):
     """constant − (w4·d + w5·|chi| + w6·‖a‖), the paper's form."""
 
     form: Literal["circle"]
-    constant: float = 0.0
+    constant: Real = 0.0
     w4_distance_1_m: NonNegative
     w5_direction_s_m2: NonNegative
     w6_action: NonNegative
