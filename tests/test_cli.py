@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -111,6 +112,8 @@ def test_resume_of_another_run_is_refused(
         (["hover", "--observation-scale", "[1,2]"], "expected 18 numbers"),
         (["hover", "--steps", "100"], "expected steps of at least"),
         (["hover", "--config", "nowhere.json"], "nowhere.json: cannot be read"),
+        (["hover", "--steps", "1e20"], "key 'steps': expected less than 2147483648"),
+        (["hover", "--seed", "1e20"], "--seed: invalid whole_number value: '1e20'"),
     ],
 )
 def test_wrong_input_is_one_clear_line(
@@ -144,6 +147,46 @@ def test_wrong_config_is_one_clear_line(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('{"seed": 3}', "key 'seed' is 0, found 3"),
+        ('{"learner": {"lam": 0.5}}', "key 'learner.lam' is 1.0, asked for 0.5"),
+    ],
+)
+def test_resume_with_another_config_is_refused(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, says: str
+) -> None:
+    """What CONFIG says counts as asked for; what it leaves out does not."""
+    file = tmp_path / "mine.json"
+    file.write_text(content)
+    assert says in complaint(capsys, "train", "pendulum", "--config", file, "--out", trained, "--resume")
+    file.write_text('{"seed": 0}')
+    assert qrl("train", "pendulum", "--config", file, "--out", trained, "--resume") == 0
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('{"task": {"name": "x", "spec": {"extend": "hoverr"}}}', "did you mean 'hover'?"),
+        ('{"task": {"name": "nope", "spec": null}}', "unknown task 'nope'"),
+    ],
+)
+def test_wrong_task_in_a_config_is_one_clear_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, says: str
+) -> None:
+    file = tmp_path / "mine.json"
+    file.write_text(content)
+    line = complaint(capsys, "train", "--config", file, "--out", tmp_path / "run")
+    assert says in line
+    assert "mine.json" in line
+
+
+def test_out_that_is_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert "expected a folder" in complaint(capsys, "train", "hover", "--out", tmp_path / "file")
+
+
 def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "not a run folder" in complaint(capsys, "evaluate", tmp_path)
 
@@ -154,6 +197,11 @@ def test_foreign_environment_trains(tmp_path: Path) -> None:
     rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     assert rows[1].split(",")[4] == ""  # success
     assert not (tmp_path / "run" / "flight.png").exists()
+    # Its rows have empty cells: a run that lost its end resumes all the same.
+    (tmp_path / "run" / "summary.json").unlink()
+    shutil.rmtree(tmp_path / "run" / "checkpoints" / "400")
+    assert qrl("train", "inverted_pendulum", "--out", tmp_path / "run", "--resume") == 0
+    assert (tmp_path / "run" / "metrics.csv").read_text().count("\n") == 3
 
 
 def test_interrupted_run_is_saved_and_goes_on(tmp_path: Path) -> None:

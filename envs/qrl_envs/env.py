@@ -150,7 +150,7 @@ class QuadrotorEnv(TaskEnv):
                 flight = measures.circle(observations, spec, spec.reward.radius_m, spec.reward.speed_m_s)
             return measures.summarise(flight, round(spec.tail_s / dt_s), dt_s)
 
-        return Evaluation(env, round(spec.duration_s / dt_s), self.task.episode_steps, measure)
+        return Evaluation(env, round(spec.duration_s / dt_s), spec.return_steps, measure)
 
 
 class PendulumEnv(TaskEnv):

@@ -94,10 +94,11 @@ class FlightEvaluation(Spec):
 
     duration_s: Positive
     tail_s: Positive
+    return_steps: Count
     distance_m: Positive  # from the hover point, or from the circle
     speed_m_s: Positive | None = None  # circle only: |tangential speed − reward's speed|
     start: FlightStart
-    reward: FlightReward  # what `return` adds up, over the first `episode_steps` of the flight
+    reward: FlightReward  # what `return` adds up, over the flight's first `return_steps`
 
     @model_validator(mode="after")
     def _consistent(self) -> "FlightEvaluation":
@@ -115,6 +116,8 @@ def _periods_fit(task: T) -> T:
             "expected control_period_s ≤ evaluation.tail_s ≤ evaluation.duration_s, found "
             f"{task.control_period_s}, {task.evaluation.tail_s}, {task.evaluation.duration_s}"
         )
+    if task.evaluation.duration_s / task.control_period_s > 1e6:
+        raise ValueError(f"expected evaluation.duration_s of at most a million periods of {task.control_period_s} s")
     return task
 
 
@@ -132,8 +135,10 @@ class QuadrotorTask(Spec):
 
     @model_validator(mode="after")
     def _consistent(self) -> "QuadrotorTask":
-        if self.reward.form != self.evaluation.reward.form:
-            raise ValueError("expected reward.form and evaluation.reward.form to be the same")
+        wanted, judged = self.reward, self.evaluation.reward
+        for name in ("form", "radius_m", "speed_m_s"):
+            if getattr(wanted, name, None) != getattr(judged, name, None):
+                raise ValueError(f"expected reward.{name} and evaluation.reward.{name} to be the same")
         return _periods_fit(self)
 
 

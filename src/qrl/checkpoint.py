@@ -24,12 +24,27 @@ def member(states: Any, index: int) -> Any:
 
 
 def save(checkpoints: ocp.CheckpointManager, env_steps: int, state: Any) -> None:
-    checkpoints.save(env_steps, args=ocp.args.StandardSave(state))
+    """Save one member's state; OSError, naming the folder, if it did not come about."""
+    try:
+        saved = checkpoints.save(env_steps, args=ocp.args.StandardSave(state))
+    except ValueError as error:  # how Orbax reports a full disk
+        raise OSError(f"{checkpoints.directory}: the checkpoint could not be written ({_first(error)})") from None
+    if not saved:
+        raise OSError(f"{checkpoints.directory}: the checkpoint at step {env_steps:,} was not written")
 
 
 def restore(checkpoints: ocp.CheckpointManager, env_steps: int, like: Any) -> Any:
     """The state saved at `env_steps`; `like` gives structure, shapes and types (one member's)."""
-    return checkpoints.restore(env_steps, args=ocp.args.StandardRestore(like))
+    try:
+        return checkpoints.restore(env_steps, args=ocp.args.StandardRestore(like))
+    except (ValueError, KeyError) as error:
+        raise OSError(
+            f"{checkpoints.directory}: the checkpoint at step {env_steps:,} cannot be read ({_first(error)})"
+        ) from None
+
+
+def _first(error: Exception) -> str:
+    return str(error).strip().split("\n")[0][:120]
 
 
 def stack(states: list[Any]) -> Any:

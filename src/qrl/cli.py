@@ -33,7 +33,7 @@ class _Parser(argparse.ArgumentParser):
 
 def whole_number(text: str) -> int:
     value = float(text)
-    if not (value >= 0 and value.is_integer()):
+    if not (0 <= value < 2**31 and value.is_integer()):
         raise ValueError
     return int(value)
 
@@ -91,6 +91,8 @@ def main(argv: list[str] | None = None) -> int:
     args = _parse(argv)
     if args.command == "train":
         print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
+    elif args.command == "evaluate":
+        print(f"qrl evaluate {args.run}: loading JAX and Brax", flush=True)
     try:
         _load()
         from qrl import commands

@@ -2,10 +2,11 @@
 
 import argparse
 import json
+import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from qrl_envs.specfile import BadInput
 EVALUATION_STARTS_SEED = 1_000_003  # other starts than the reports'
 PICTURE_FLIGHTS = 5
 
-console = Console(highlight=False, soft_wrap=True)
+console = Console(highlight=False, markup=False, soft_wrap=True)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -40,6 +41,9 @@ def run(args: argparse.Namespace) -> int:
         return FAILED
     except OSError as error:
         complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return FAILED
+    except jax.errors.JaxRuntimeError as error:  # out of memory, above all
+        complain(str(error))
         return FAILED
     except KeyboardInterrupt:
         complain("interrupted")
@@ -60,14 +64,17 @@ def list_tasks(_: argparse.Namespace) -> int:
 def train(args: argparse.Namespace) -> int:
     begun = time.perf_counter()
     flags = _flags(args)
-    config = request.run_config(args.task, args.config, flags, args.seed, args.seeds)
+    file = request.config_file(args.config)
+    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds)
     out: Path = args.out or Path("runs") / config.task.name
+    if out.exists() and not out.is_dir():
+        raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
     held = (out / "config.json").exists()
     if held and not args.resume:
         raise BadInput(f"{out}: holds a run already; give another OUT, or RESUME=1 to go on with it")
     if held:
-        given = flags | (config.learner.model_dump() if args.config else {})
-        config = request.resumed(out, config, given, args.seed, args.seeds)
+        seed = args.seed if args.seed is not None else file.seed
+        config = request.resumed(out, config, file.learner | flags, seed, args.seeds or file.seeds)
         if loop.finished(out, config):
             console.print(f"{out}: finished already; nothing to do")
             return DONE
@@ -79,22 +86,27 @@ def train(args: argparse.Namespace) -> int:
     with _stop_requested() as stopped:
         flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
         if flights is None:
-            console.print(f"stopped, all saved; to go on: make train TASK={args.task or ''} OUT={out} RESUME=1")
+            what = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
+            console.print(f"stopped and saved; to go on: make train {what} OUT={shlex.quote(str(out))} RESUME=1")
             return FAILED
     _finish(out, config, flights, time.perf_counter() - begun)
     return DONE
 
 
 def _flags(args: argparse.Namespace) -> dict[str, Any]:
-    """The learner's flags that were given, each read as JSON where it is JSON, else as text."""
+    """The learner's flags that were given, each read as JSON or a number where it is one, else as text."""
     given: dict[str, Any] = {}
     for name, text in vars(args).items():
         if name.startswith("learner.") and text is not None:
-            try:
-                given[name.removeprefix("learner.")] = json.loads(text)
-            except json.JSONDecodeError:
-                given[name.removeprefix("learner.")] = text
+            given[name.removeprefix("learner.")] = _value(text)
     return given
+
+
+def _value(text: str) -> Any:
+    for read in (json.loads, float):  # float: .95, which JSON does not know
+        with suppress(ValueError, RecursionError):
+            return read(text)
+    return text
 
 
 def _prepare(out: Path, config: RunConfig, held: bool) -> None:

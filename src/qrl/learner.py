@@ -135,11 +135,11 @@ class Learner:
         log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
 
         # A^mu needs no correction for the difference between pi and mu; with rho = 1 the trace is GAE(lambda).
-        rho = jnp.exp(log_rho) if config.advantage == "pi" else jnp.ones_like(log_rho)
+        off_policy = config.advantage == "pi"
+        rho = jnp.exp(log_rho) if off_policy else jnp.ones_like(log_rho)
+        rho_bar, c_bar = (config.rho_bar, config.c_bar) if off_policy else (1.0, 1.0)
         trace = jax.vmap(
-            lambda *trajectory: vtrace(
-                *trajectory, gamma=config.gamma, lam=config.lam, rho_bar=config.rho_bar, c_bar=config.c_bar
-            )
+            lambda *trajectory: vtrace(*trajectory, gamma=config.gamma, lam=config.lam, rho_bar=rho_bar, c_bar=c_bar)
         )(
             config.reward_scale * batch.reward,
             jax.lax.stop_gradient(value),

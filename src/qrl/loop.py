@@ -154,6 +154,8 @@ def restore(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState
 
     Raises FileNotFoundError, naming the folder, where there is none.
     """
+    if not (folder / "checkpoints").is_dir():
+        raise FileNotFoundError(f"{folder}: no checkpoint")
     trainer = Trainer(env, run.learner)
     with checkpoint.manager(folder) as saved:
         latest = saved.latest_step()
@@ -172,14 +174,14 @@ def _one(states: TrainState) -> TrainState:
 def _restore_latest(states: TrainState, members: list[Member]) -> TrainState:
     """The last checkpoint that every seed has, later ones and later rows dropped; `states` where there is none."""
     common = set.intersection(*[set(member.checkpoints.all_steps()) for member in members])
-    if not common:
-        return states
-    latest = max(common)
+    latest = max(common, default=0)
     for member in members:
         member.rows = [row for row in runs.read_metrics(member.folder) if row["env_steps"] <= latest]
         for step in member.checkpoints.all_steps():
             if step > latest:
                 member.checkpoints.delete(step)
+    if not latest:
+        return states
     like = _one(states)
     return jax.tree.map(
         jnp.asarray, checkpoint.stack([checkpoint.restore(member.checkpoints, latest, like) for member in members])

@@ -37,34 +37,62 @@ def environment(record: TaskRecord) -> Env:
     return worlds.from_task(tasks.from_data(record.spec, record.name))
 
 
+def config_file(path: Path | None) -> ConfigFile:
+    """What CONFIG holds, its task checked; nothing where there is no CONFIG."""
+    if path is None:
+        return ConfigFile()
+    file = specfile.build(ConfigFile, specfile.read(path), str(path))
+    record = file.task
+    if isinstance(record, str):
+        record = task_record(record)
+    elif record:
+        record = _checked(record, str(path))
+    return file.model_copy(update={"task": record})
+
+
+def _checked(record: TaskRecord, where: str) -> TaskRecord:
+    if record.spec is not None:
+        spec = tasks.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
+        return TaskRecord(name=record.name, spec=spec)
+    if record.name not in foreign_tasks():
+        raise BadInput(f"{where}: key 'task.name': unknown task '{record.name}'")
+    return record
+
+
 def run_config(
-    task: str | None, config: Path | None, flags: dict[str, Any], seed: int | None, seeds: int | None
+    task: str | None, config: Path | None, file: ConfigFile, flags: dict[str, Any], seed: int | None, seeds: int | None
 ) -> RunConfig:
-    """The run asked for: flags over CONFIG over the task's preset over the default preset."""
-    where = str(config)
-    file = specfile.build(ConfigFile, specfile.read(config), where) if config else ConfigFile()
-    record = task_record(file.task) if isinstance(file.task, str) else file.task
+    """The run asked for: flags over CONFIG (`file`, read from `config`) over the task's preset over the default."""
+    record = file.task
+    assert not isinstance(record, str)  # config_file saw to it
     if task:
         asked = task_record(task)
         if record and record != asked:
-            raise BadInput(f"{where}: key 'task': expected the task asked for, '{task}', found '{record.name}'")
+            raise BadInput(f"{config}: key 'task': expected the task asked for, '{task}', found '{record.name}'")
         record = asked
     if not record:
         raise BadInput(f"no task given (known: {', '.join(tasks.shipped())}; all: qrl tasks)")
-    preset = record.spec["preset"] if record.spec else "default"
-    if preset not in runs.presets():
-        raise BadInput(f"{task}: key 'preset': no preset '{preset}'{specfile.nearest(preset, runs.presets())}")
-    base = runs.preset(preset) | file.learner
-    if file.learner:
-        specfile.build(Config, base, f"{where}: learner")
     return RunConfig(
         task=record,
-        learner=specfile.build(Config, base | flags, "command line" if flags else f"preset {preset}"),
+        learner=_learner(record, config, file.learner, flags),
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=runs.versions(),
         devices=[str(device) for device in jax.devices()],
     )
+
+
+def _learner(record: TaskRecord, config: Path | None, learner: dict[str, Any], flags: dict[str, Any]) -> Config:
+    preset = record.spec["preset"] if record.spec else "default"
+    if preset not in runs.presets():
+        raise BadInput(f"{record.name}: key 'preset': no preset '{preset}'{specfile.nearest(preset, runs.presets())}")
+    base = runs.preset(preset) | learner
+    file = f"{config}: learner" if config else f"preset {preset}"
+    try:
+        return specfile.build(Config, base | flags, "command line")
+    except BadInput:
+        specfile.build(Config, base, file)  # the file's fault, if it is wrong without the flags too
+        raise
 
 
 def check(env: Env, learner: Config) -> None:
@@ -75,6 +103,11 @@ def check(env: Env, learner: Config) -> None:
     given = len(learner.observation_scale or ())
     if given not in (0, size):
         raise BadInput(f"key 'observation_scale': expected {size} numbers, one for each observation, found {given}")
+    try:
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
+    except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
+        raise BadInput(f"this environment does not work with jax {jax.__version__}: {error}") from None
 
 
 def stored(folder: Path) -> RunConfig:
@@ -82,7 +115,8 @@ def stored(folder: Path) -> RunConfig:
     path = folder / "config.json"
     if not path.exists():
         raise BadInput(f"{folder}: not a run folder (no config.json)")
-    return specfile.build(RunConfig, specfile.read(path), str(path))
+    run = specfile.build(RunConfig, specfile.read(path), str(path))
+    return run.model_copy(update={"task": _checked(run.task, str(path))})
 
 
 def resumed(folder: Path, asked: RunConfig, given: dict[str, Any], seed: int | None, seeds: int | None) -> RunConfig:

@@ -99,19 +99,16 @@ Row = dict[str, float | int]
 
 
 def read_metrics(folder: Path) -> list[Row]:
-    """The rows of metrics.csv; empty cells (not measured) are left out."""
+    """The rows of metrics.csv; an empty cell (not measured) is NaN."""
     path = folder / "metrics.csv"
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as file:
-        return [
-            {
-                key: float(cell) if "." in cell or "n" in cell or "e" in cell else int(cell)
-                for key, cell in row.items()
-                if cell
-            }
-            for row in csv.DictReader(file)
-        ]
+        return [{key: _number(cell) for key, cell in row.items()} for row in csv.DictReader(file)]
+
+
+def _number(cell: str) -> float | int:
+    return int(cell) if cell.lstrip("-").isdigit() else float(cell or "nan")
 
 
 def write_metrics(folder: Path, rows: list[Row]) -> None:

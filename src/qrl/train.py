@@ -129,7 +129,7 @@ class Trainer:
 
     def _fault(self, seen: Transition, terms: Terms, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
         """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are."""
-        collected = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (seen.reward, seen.observation)])
+        collected = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (seen.reward, seen.next_observation)])
         finite = jnp.concatenate(
             [jnp.tile(collected, (self.config.updates_per_unroll, 1)), jnp.isfinite(jnp.stack(terms, axis=1))], axis=1
         )
