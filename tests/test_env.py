@@ -295,14 +295,14 @@ def test_the_bounds_travel_with_the_lane(hover: World) -> None:
 
 
 def test_evaluation_flies_its_own_starts_and_reward() -> None:
-    """Whatever ranges and weights training uses."""
+    """Whatever ranges, weights and episodes training uses; the return is of the first 200 steps."""
     spec = task.from_data(
         {"extend": "hover", "start": {"position_m": 0.1}, "reward": {"w3_action": 9.0}, "episode_steps": 150}, "here"
     )
     assert isinstance(spec, task.QuadrotorTask)
     plan = env.from_task(spec).evaluation()
     assert isinstance(plan.env, TaskEnv)
-    assert (plan.steps, plan.return_steps) == (800, 150)
+    assert (plan.steps, plan.return_steps) == (800, 200)
     np.testing.assert_allclose(plan.env.params.start, [2.0, 1.0, 1.0])
     np.testing.assert_allclose(plan.env.params.reward, [1.0, 0.2, 0.2, 0.2])
 
