@@ -114,7 +114,10 @@ def test_the_title_says_the_task_and_the_counts() -> None:
 OTHER: dict[str, tuple[dict, list[list[float]], list[list[float]]]] = {  # task file; lines in flights, in errors
     "hover": ({"evaluation": {"distance_m": 0.25}}, [[], [0.25], []], [[0.25], []]),
     "circle": (
-        {"evaluation": {"distance_m": 0.3, "speed_m_s": 0.5, "reward": {"speed_m_s": 1.5, "radius_m": 1.25}}},
+        {
+            "reward": {"speed_m_s": 1.5, "radius_m": 1.25},
+            "evaluation": {"distance_m": 0.3, "speed_m_s": 0.5, "reward": {"speed_m_s": 1.5, "radius_m": 1.25}},
+        },
         [[], [0.3], [1.0, 2.0]],
         [[0.3], [0.3], [0.5], []],
     ),

@@ -182,6 +182,7 @@ MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
         ),
         ["reward.form", "evaluation.reward.form"],
     ),
+    "another circle judged than wanted": (circle('"reward": {"radius_m": 0.5}'), ["reward.radius_m", "evaluation"]),
     "tail longer than the flight": (hover('"evaluation": {"tail_s": 9}'), ["evaluation.tail_s", "8.0", "9.0"]),
     "speed tolerance for hover": (hover('"evaluation": {"speed_m_s": 0.2}'), ["'evaluation'", "speed_m_s", "circle"]),
     "no speed tolerance for the circle": (
