@@ -2,11 +2,13 @@
 
 `state.pipeline_state` is a `Lane`: the lane's own task (physics, reward weights, start ranges, bounds) travels
 with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` offers `restart` (a
-fresh start that keeps the lane's task) and `evaluation`. An episode that ends early by leaving the bounds has
-`done = 1` and `info["truncated"] = 1`: whoever bootstraps should treat it as a truncation.
+fresh start that keeps the lane's task), `under` (the same world with other parameters) and `evaluation`. An
+episode that ends early by leaving the bounds has `done = 1` and `info["truncated"] = 1`: whoever bootstraps
+should treat it as a truncation.
 """
 
 import abc
+import copy
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,7 +22,7 @@ from qrl_envs.task import PendulumTask, QuadrotorTask, Task
 
 
 class Params(NamedTuple):
-    """The task of one lane as a pytree."""
+    """The task of one lane as a pytree; what of a task it holds is `task.TRACED`."""
 
     physics: Any
     reward: Any
@@ -67,6 +69,12 @@ class TaskEnv(Env):
     @property
     def episode_steps(self) -> int:
         return self.task.episode_steps
+
+    def under(self, params: Params) -> "TaskEnv":
+        """This environment with other parameters of the same structure, which may be tracers."""
+        other = copy.copy(self)
+        other.params = params
+        return other
 
     def reset(self, rng: chex.PRNGKey) -> State:
         """A fresh start drawn with `rng` (a legacy or typed key)."""
@@ -141,7 +149,8 @@ class QuadrotorEnv(TaskEnv):
 
     def evaluation(self) -> Evaluation:
         spec, dt_s = self.task.evaluation, self.task.control_period_s
-        env = QuadrotorEnv(self.task.model_copy(update={"start": spec.start, "reward": spec.reward}))
+        judged = {"start": quadrotor.start(spec.start), "reward": rewards.from_spec(spec.reward)}
+        env = self.under(self.params._replace(**judged))
 
         def measure(observations: chex.Array) -> dict[str, chex.Array]:
             if spec.reward.form == "hover":
@@ -180,7 +189,12 @@ class PendulumEnv(TaskEnv):
         def measure(observations: chex.Array) -> dict[str, chex.Array]:
             return measures.summarise(measures.pendulum(observations, spec), round(spec.tail_s / dt_s), dt_s)
 
-        return Evaluation(self, round(spec.duration_s / dt_s), self.task.episode_steps, measure)
+        params = self.params
+        if spec.start:
+            params = params._replace(start=pendulum.start(spec.start))
+        if spec.reward:
+            params = params._replace(reward=rewards.from_spec(spec.reward))
+        return Evaluation(self.under(params), round(spec.duration_s / dt_s), self.task.episode_steps, measure)
 
 
 def from_task(task: Task) -> TaskEnv:

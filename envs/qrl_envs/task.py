@@ -171,6 +171,8 @@ class PendulumEvaluation(Spec):
     tail_s: Positive
     angle_rad: Positive
     rate_rad_s: Positive
+    start: PendulumStart | None = None  # null: as in training
+    reward: PendulumReward | None = None  # what `return` adds up; null: as in training
 
 
 class PendulumTask(Spec):
@@ -190,6 +192,9 @@ class PendulumTask(Spec):
 
 
 Task = QuadrotorTask | PendulumTask
+
+# What of a task is numbers that a compiled program takes as arguments (env.Params); all else shapes the program.
+TRACED = ("vehicle", "rod", "start", "bounds", "reward")
 _ANY_TASK = Annotated[Task, Field(discriminator="world")]
 
 

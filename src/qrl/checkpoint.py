@@ -45,8 +45,3 @@ def restore(checkpoints: ocp.CheckpointManager, env_steps: int, like: Any) -> An
 
 def _first(error: Exception) -> str:
     return str(error).strip().split("\n")[0][:120]
-
-
-def stack(states: list[Any]) -> Any:
-    """Members' states side by side again."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *states)

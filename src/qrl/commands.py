@@ -19,6 +19,7 @@ from qrl import loop, plots, request, runs
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.runs import Row, RunConfig
+from qrl.train import point, stack
 from qrl_envs import picture
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
@@ -231,7 +232,7 @@ def evaluate(args: argparse.Namespace) -> int:
             trainer, state, env_steps = loop.restore(env, config, folder)
         except FileNotFoundError as error:
             raise BadInput(str(error)) from None
-        flights = jax.tree.map(lambda x: x[0], trainer.fly(state.learner, starts))
+        flights = jax.tree.map(lambda x: x[0], trainer.fly(state.learner, stack([point(env, config.learner)]), starts))
         result = {"seed": config.seed + i, "env_steps": env_steps, "starts": args.starts, **summarise(flights)}
         runs.write_json(folder / "evaluation.json", result)
         if config.task.spec:

@@ -1,6 +1,11 @@
-"""The learner's hyperparameters: declared once here, valued in presets/*.json (paper's symbols, FIELD's terms)."""
+"""The learner's hyperparameters: declared once here, valued in presets/*.json (paper's symbols, FIELD's terms).
 
-from typing import Annotated, Any, Literal
+Each is declared `Traced` or `Static`. Traced ones reach the compiled program as its arguments, so that runs that
+differ in them alone share one program; static ones (shapes, counts, choices, whether an optional one is there at all)
+shape the program.
+"""
+
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
@@ -15,53 +20,61 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
+T = TypeVar("T")
+Traced = Annotated[T, "traced"]
+Static = Annotated[T, "static"]
+
 
 class Config(BaseModel):
     """Everything that the learner may be told. The defaults are src/qrl/presets/default.json."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    steps: Count = Field(description="environment steps in all")
-    episode_steps: Count | None = Field(description="longest training episode; null: the task's own")
-    lanes: Count = Field(description="environments stepped side by side")
-    unroll_steps: Count = Field(description="T: steps of one unroll, the trajectory length of Algorithm 2")
-    ring_unrolls: Count = Field(description="slots of the ring buffer, each one unroll of all lanes")
-    warmup_unrolls: Count = Field(description="unrolls collected before learning starts")
-    updates_per_unroll: Count = Field(description="minibatch updates after each unroll")
-    minibatch_lanes: Count = Field(description="trajectories (slot, lane) of one minibatch")
+    steps: Static[Count] = Field(description="environment steps in all")
+    episode_steps: Static[Count | None] = Field(description="longest training episode; null: the task's own")
+    lanes: Static[Count] = Field(description="environments stepped side by side")
+    unroll_steps: Static[Count] = Field(description="T: steps of one unroll, the trajectory length of Algorithm 2")
+    ring_unrolls: Static[Count] = Field(description="slots of the ring buffer, each one unroll of all lanes")
+    warmup_unrolls: Static[Count] = Field(description="unrolls collected before learning starts")
+    updates_per_unroll: Static[Count] = Field(description="minibatch updates after each unroll")
+    minibatch_lanes: Static[Count] = Field(description="trajectories (slot, lane) of one minibatch")
 
-    policy_hidden: tuple[Count, ...] = Field(description="hidden layers of the policy")
-    critic_hidden: tuple[Count, ...] = Field(description="hidden layers of the critic")
-    activation: Literal["relu", "tanh"] = Field(description="activation of both networks")
-    observation_scale: tuple[Positive, ...] | None = Field(
+    policy_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the policy")
+    critic_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the critic")
+    activation: Static[Literal["relu", "tanh"]] = Field(description="activation of both networks")
+    observation_scale: Traced[tuple[Positive, ...] | None] = Field(
         description="factor on each observation before the networks; null: 1"
     )
-    normalise_observations: bool = Field(description="standardise observations by their running mean and deviation")
-    reward_scale: Positive = Field(description="factor on rewards, so that |V| is about 1")
+    normalise_observations: Static[bool] = Field(
+        description="standardise observations by their running mean and deviation"
+    )
+    reward_scale: Traced[Positive] = Field(description="factor on rewards, so that |V| is about 1")
 
-    learning_rate: Positive = Field(description="Adam's step size at the start")
-    learning_rate_end: NonNegative = Field(description="and at the end, linear in between")
-    gradient_clip: Positive = Field(description="global norm at which each network's gradient is clipped")
-    sigma: Positive = Field(description="the policy's standard deviation at the start")
-    sigma_end: Positive = Field(description="and at the end, log-linear in between")
-    average_fraction: Fraction = Field(
+    learning_rate: Traced[Positive] = Field(description="Adam's step size at the start")
+    learning_rate_end: Traced[NonNegative] = Field(description="and at the end, linear in between")
+    gradient_clip: Traced[Positive] = Field(description="global norm at which each network's gradient is clipped")
+    sigma: Traced[Positive] = Field(description="the policy's standard deviation at the start")
+    sigma_end: Traced[Positive] = Field(description="and at the end, log-linear in between")
+    average_fraction: Static[Fraction] = Field(
         description="last part of the run over which the policy that ships is averaged; 0: not averaged"
     )
 
-    gamma: Fraction = Field(description="discount")
-    lam: Fraction = Field(description="lambda of the trace; 1 in the paper")
-    rho_bar: Positive = Field(description="V-trace's clip of rho in the temporal difference; 1 in the paper")
-    c_bar: Positive = Field(description="V-trace's clip of rho in the trace; 1 in the paper")
-    advantage: Literal["pi", "mu"] = Field(
+    gamma: Traced[Fraction] = Field(description="discount")
+    lam: Traced[Fraction] = Field(description="lambda of the trace; 1 in the paper")
+    rho_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the temporal difference; 1 in the paper")
+    c_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the trace; 1 in the paper")
+    advantage: Static[Literal["pi", "mu"]] = Field(
         description="pi: A^pi by V-trace (conditions 3, 4); mu: A^mu by GAE(lambda) (conditions 1, 2)"
     )
-    form: Literal["ratio", "difference"] = Field(description="pi/mu − 1 (conditions 2, 4) or pi − mu (conditions 1, 3)")
-    epsilon: Positive = Field(description="margin epsilon·|A|")
-    xi: Positive | None = Field(description="constant margin in its stead; null: none")
-    normalise_advantage: bool = Field(description="divide A by its root mean square over the minibatch")
+    form: Static[Literal["ratio", "difference"]] = Field(
+        description="pi/mu − 1 (conditions 2, 4) or pi − mu (conditions 1, 3)"
+    )
+    epsilon: Traced[Positive] = Field(description="margin epsilon·|A|")
+    xi: Traced[Positive | None] = Field(description="constant margin in its stead; null: none")
+    normalise_advantage: Static[bool] = Field(description="divide A by its root mean square over the minibatch")
 
-    reports: Count = Field(description="reports, evaluations and checkpoints of a run")
-    report_flights: Count = Field(description="fixed starts flown at each report")
+    reports: Static[Count] = Field(description="reports, evaluations and checkpoints of a run")
+    report_flights: Static[Count] = Field(description="fixed starts flown at each report")
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
@@ -71,6 +84,17 @@ class Config(BaseModel):
                 f" = {self.warmup_unrolls * self.unroll_size:,}, found {self.steps:,}"
             )
         return self
+
+    @property
+    def traced(self) -> dict[str, Any]:
+        """The traced hyperparameters that are there (not null)."""
+        return {name: value for name in TRACED if (value := getattr(self, name)) is not None}
+
+    @property
+    def static(self) -> dict[str, Any]:
+        """What must be the same for two runs to share one compiled program, plain enough for JSON."""
+        shapes = {name: len(value) if isinstance(value, tuple) else 1 for name, value in self.traced.items()}
+        return {**self.model_dump(mode="json", exclude=set(TRACED)), "traced": shapes}
 
     @property
     def unroll_size(self) -> int:
@@ -85,3 +109,6 @@ class Config(BaseModel):
     @property
     def unrolls_per_report(self) -> int:
         return max(1, -(-self.unrolls // self.reports))
+
+
+TRACED = tuple(name for name, field in Config.model_fields.items() if "traced" in field.metadata)

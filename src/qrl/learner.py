@@ -1,11 +1,12 @@
 """One minibatch update: V-trace or GAE, the perceptron objective, the value loss, Adam (Algorithm 1)."""
 
-import math
+import copy
 from typing import NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from brax.training.acme import running_statistics as statistics
 
@@ -36,6 +37,14 @@ class Terms(NamedTuple):
     value_gradient: chex.Array
 
 
+Hyper = dict[str, chex.Array]  # the traced hyperparameters by name, float32: [], or [F] of observation_scale
+
+
+def hyper(config: Config) -> Hyper:
+    """The traced hyperparameters of `config` as arrays; those that are null are absent."""
+    return {name: np.asarray(value, np.float32) for name, value in config.traced.items()}
+
+
 class Learner:
     """The learner's pure functions for one environment's sizes and one configuration; holds no state."""
 
@@ -45,10 +54,19 @@ class Learner:
         self.policy = MLP(config.policy_hidden, action_size, config.activation, final_gain=0.01)
         self.critic = MLP(config.critic_hidden, 1, config.activation, final_gain=1.0)
         self.total_updates = max(1, (config.unrolls - config.warmup_unrolls + 1) * config.updates_per_unroll)
-        self._scale = jnp.asarray(config.observation_scale or (1.0,) * observation_size, jnp.float32)
+        self._set(hyper(config))
+
+    def under(self, hyper: Hyper) -> "Learner":
+        """This learner with other values of the traced hyperparameters, which may be tracers."""
+        other = copy.copy(self)
+        other._set(hyper)
+        return other
+
+    def _set(self, hyper: Hyper) -> None:
+        self.hyper = hyper
         # One flat vector for each network: far fewer, larger operations than leaf by leaf.
         self._optimiser = optax.flatten(
-            optax.chain(optax.clip_by_global_norm(config.gradient_clip), optax.scale_by_adam())
+            optax.chain(optax.clip_by_global_norm(hyper["gradient_clip"]), optax.scale_by_adam())  # pyright: ignore[reportArgumentType]
         )
 
     def init(self, key: chex.PRNGKey) -> LearnerState:
@@ -69,14 +87,14 @@ class Learner:
 
     def sigma(self, state: LearnerState) -> chex.Array:
         """The policy's standard deviation, log-linear in the run's progress; []."""
-        start, end = math.log(self.config.sigma), math.log(self.config.sigma_end)
+        start, end = jnp.log(self.hyper["sigma"]), jnp.log(self.hyper["sigma_end"])
         return jnp.exp(start + (end - start) * self.progress(state))
 
     def scale(self, state: LearnerState, observation: chex.Array) -> chex.Array:
         """Observations as the networks see them; [..., F] -> [..., F]."""
         if self.config.normalise_observations:
             observation = statistics.normalize(observation, state.statistics, max_abs_value=10.0)
-        return observation * self._scale
+        return observation * self.hyper["observation_scale"] if "observation_scale" in self.hyper else observation
 
     def mean(self, state: LearnerState, observation: chex.Array) -> chex.Array:
         """The policy's mean action; [..., F] -> [..., A]."""
@@ -101,9 +119,8 @@ class Learner:
     def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
         """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""
         gradient, terms = jax.grad(self._loss, has_aux=True)(state.params, state, batch)
-        rate = self.config.learning_rate + self.progress(state) * (
-            self.config.learning_rate_end - self.config.learning_rate
-        )
+        start, end = self.hyper["learning_rate"], self.hyper["learning_rate_end"]
+        rate = start + self.progress(state) * (end - start)
 
         def ascend(params: chex.ArrayTree, gradient: chex.ArrayTree, opt: chex.ArrayTree) -> tuple[chex.ArrayTree, ...]:
             direction, opt = self._optimiser.update(gradient, opt)
@@ -120,7 +137,7 @@ class Learner:
         return self._averaged(state), terms
 
     def _loss(self, params: Networks, state: LearnerState, batch: Transition) -> tuple[chex.Array, Terms]:
-        config = self.config
+        config, hyper = self.config, self.hyper
         samples = batch.reward.shape
 
         def flat(x: chex.Array) -> chex.Array:
@@ -137,11 +154,13 @@ class Learner:
         # A^mu needs no correction for the difference between pi and mu; with rho = 1 the trace is GAE(lambda).
         off_policy = config.advantage == "pi"
         rho = jnp.exp(log_rho) if off_policy else jnp.ones_like(log_rho)
-        rho_bar, c_bar = (config.rho_bar, config.c_bar) if off_policy else (1.0, 1.0)
+        rho_bar, c_bar = (hyper["rho_bar"], hyper["c_bar"]) if off_policy else (1.0, 1.0)
         trace = jax.vmap(
-            lambda *trajectory: vtrace(*trajectory, gamma=config.gamma, lam=config.lam, rho_bar=rho_bar, c_bar=c_bar)
+            lambda *trajectory: vtrace(
+                *trajectory, gamma=hyper["gamma"], lam=hyper["lam"], rho_bar=rho_bar, c_bar=c_bar
+            )
         )(
-            config.reward_scale * batch.reward,
+            hyper["reward_scale"] * batch.reward,
             jax.lax.stop_gradient(value),
             next_value,
             batch.terminated,
@@ -151,9 +170,8 @@ class Learner:
         a_trace = trace.a_trace
         if config.normalise_advantage:
             a_trace = a_trace / (jnp.sqrt(jnp.mean(a_trace**2)) + 1e-8)
-        policy_loss = -jnp.mean(
-            perceptron(log_pi, batch.log_mu, a_trace, form=config.form, epsilon=config.epsilon, xi=config.xi)
-        )
+        margins = {"epsilon": hyper["epsilon"], "xi": hyper.get("xi")}
+        policy_loss = -jnp.mean(perceptron(log_pi, batch.log_mu, a_trace, form=config.form, **margins))
         value_loss = jnp.mean((value - trace.v_trace) ** 2)
         zero = jnp.zeros(())
         return policy_loss + value_loss, Terms(

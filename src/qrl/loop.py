@@ -16,7 +16,7 @@ from qrl import checkpoint, runs
 from qrl.config import Config
 from qrl.evaluate import Flights, summarise
 from qrl.runs import Row, RunConfig
-from qrl.train import FAULT_TERMS, Totals, Trainer, TrainState
+from qrl.train import FAULT_TERMS, Totals, Trainer, TrainState, point, stack
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # how long the device works between two signs of life
@@ -60,6 +60,25 @@ class Finished:
 Event = Compiling | Progress | Reported | Finished
 
 
+@dataclass(frozen=True)
+class Lap:
+    """Members have come this far; `states` are alive until the next lap is asked for."""
+
+    states: TrainState
+    env_steps: int
+    steps_per_second: float
+    seconds_left: float
+    rows: list[Row]  # where a report is due: one for each member
+
+
+@dataclass(frozen=True)
+class Programs:
+    """What runs members: a trainer's programs, compiled for their number and bound to their points."""
+
+    advance: Callable[[TrainState, np.int32], TrainState]
+    fly: Callable[[TrainState], Flights]
+
+
 @dataclass
 class Member:
     """What the host keeps of one seed."""
@@ -83,70 +102,89 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
 
     Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept.
     """
-    config = run.learner
-    trainer = Trainer(env, config)
+    trainer = Trainer(env, run.learner)
+    points = trainer.place(stack([point(env, run.learner)] * run.seeds))
     members = [
         Member(folder, checkpoint.manager(folder), SummaryWriter(str(folder / "tensorboard")), [])
         for folder in runs.members(out, run)
     ]
     try:
         yield Compiling("first state")
-        states = trainer.init(jnp.arange(run.seed, run.seed + run.seeds))
+        states = trainer.init(trainer.place(seeds(run.seed, run.seeds)), points)
         if resume:
-            states = _restore_latest(states, members)
+            states = _restore_latest(trainer, states, members)
         yield Compiling("training")
-        advance = trainer.advance.lower(states, jnp.int32(0)).compile()
+        advance = trainer.advance.lower(states, points, np.int32(0)).compile()
         yield Compiling("evaluation")
-        starts = jax.random.split(jax.random.PRNGKey(REPORT_STARTS_SEED), config.report_flights)
-        fly = trainer.fly.lower(states.learner, starts).compile()
-        yield from _advance_and_report(states, advance, lambda s: fly(s.learner, starts), run, members, stopped)
+        starts = report_starts(run.learner)
+        fly = trainer.fly.lower(states.learner, points, starts).compile()
+        programs = Programs(
+            lambda states, until: advance(states, points, until), lambda states: fly(states.learner, points, starts)
+        )
+        yield from _advance_and_report(states, programs, run, members, stopped)
     finally:
         for member in members:
             member.writer.close()
             member.checkpoints.close()
 
 
+def seeds(first: int, count: int) -> np.ndarray:
+    return np.arange(first, first + count, dtype=np.int32)
+
+
+def report_starts(config: Config) -> jax.Array:
+    """Keys of the starts that every report of every run flies."""
+    return jax.random.split(jax.random.PRNGKey(REPORT_STARTS_SEED), config.report_flights)
+
+
 def _advance_and_report(
-    states: TrainState,
-    advance: Callable[[TrainState, jax.Array], TrainState],
-    fly: Callable[[TrainState], Flights],
-    run: RunConfig,
-    members: list[Member],
-    stopped: Callable[[], bool],
+    states: TrainState, programs: Programs, run: RunConfig, members: list[Member], stopped: Callable[[], bool]
 ) -> Iterator[Event]:
-    config = run.learner
-    done = first = int(states.unrolls[0])
-    began = time.perf_counter()
+    lap, saved = None, True
     clock = members[0].rows[-1]["train_seconds"] if members[0].rows else 0.0
+    for lap in laps(states, programs, run.learner, clock, stopped):
+        states = lap.states
+        _check(states, run, members)
+        saved = bool(lap.rows)
+        if not lap.rows:
+            yield Progress(lap.env_steps, lap.steps_per_second, lap.seconds_left)
+            continue
+        # The row first: killed between the two, a resumed run cuts it and makes it again.
+        for member, row in zip(members, lap.rows, strict=True):
+            member.record(row)
+        _save(states, members, lap.env_steps)
+        yield Reported(lap.rows, lap.seconds_left)
+    if int(states.unrolls[0]) == run.learner.unrolls:
+        yield Finished(programs.fly(states))
+    elif lap and not saved:
+        _save(states, members, lap.env_steps)
+
+
+def laps(
+    states: TrainState, programs: Programs, config: Config, clock: float, stopped: Callable[[], bool]
+) -> Iterator[Lap]:
+    """Advance all members to the end or until `stopped()`, a lap about CHUNK_SECONDS; `clock`: seconds trained."""
+    done = first = int(states.unrolls[0])
+    count = len(states.unrolls)
+    began = time.perf_counter()
     since_report, chunk = 0.0, 1
     while done < config.unrolls and not stopped():
         report_at = min(config.unrolls, (done // config.unrolls_per_report + 1) * config.unrolls_per_report)
         until = min(report_at, done + chunk)
         lap = time.perf_counter()
-        states = jax.block_until_ready(advance(states, jnp.int32(until)))
+        states = jax.block_until_ready(programs.advance(states, np.int32(until)))
         lap = time.perf_counter() - lap
-        _check(states, run, members)
         clock, since_report = clock + lap, since_report + lap
         chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))
-        speed = (until - done) * config.unroll_size * run.seeds / lap
+        speed = (until - done) * config.unroll_size * count / lap
         done = until
         left = (time.perf_counter() - began) / (done - first) * (config.unrolls - done)
-        if done < report_at:
-            yield Progress(done * config.unroll_size, speed, left)
-            continue
-        flights = fly(states)
-        rows = _rows(config, states, flights, clock, since_report)
-        states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
-        since_report = 0.0
-        # The row first: killed between the two, a resumed run cuts it and makes it again.
-        for member, row in zip(members, rows, strict=True):
-            member.record(row)
-        _save(states, members, done * config.unroll_size)
-        yield Reported(rows, left)
-    if done == config.unrolls:
-        yield Finished(fly(states))
-    elif done > first and done % config.unrolls_per_report:
-        _save(states, members, done * config.unroll_size)
+        rows: list[Row] = []
+        if done == report_at:
+            rows = _rows(config, states, programs.fly(states), clock, since_report)
+            states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
+            since_report = 0.0
+        yield Lap(states, done * config.unroll_size, speed, left, rows)
 
 
 def restore(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState, int]:
@@ -161,9 +199,9 @@ def restore(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState
         latest = saved.latest_step()
         if latest is None:
             raise FileNotFoundError(f"{folder}: no checkpoint")
-        like = jax.eval_shape(trainer.init, jnp.zeros(1, jnp.int32))
+        like = jax.eval_shape(trainer.init, seeds(0, 1), stack([point(env, run.learner)]))
         state = checkpoint.restore(saved, latest, _one(like))
-    return trainer, jax.tree.map(jnp.asarray, checkpoint.stack([state])), latest
+    return trainer, trainer.place(stack([state])), latest
 
 
 def _one(states: TrainState) -> TrainState:
@@ -171,7 +209,7 @@ def _one(states: TrainState) -> TrainState:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
 
 
-def _restore_latest(states: TrainState, members: list[Member]) -> TrainState:
+def _restore_latest(trainer: Trainer, states: TrainState, members: list[Member]) -> TrainState:
     """The last checkpoint that every seed has, later ones and later rows dropped; `states` where there is none."""
     common = set.intersection(*[set(member.checkpoints.all_steps()) for member in members])
     latest = max(common, default=0)
@@ -183,9 +221,7 @@ def _restore_latest(states: TrainState, members: list[Member]) -> TrainState:
     if not latest:
         return states
     like = _one(states)
-    return jax.tree.map(
-        jnp.asarray, checkpoint.stack([checkpoint.restore(member.checkpoints, latest, like) for member in members])
-    )
+    return trainer.place(stack([checkpoint.restore(member.checkpoints, latest, like) for member in members]))
 
 
 def _save(states: TrainState, members: list[Member], env_steps: int) -> None:
@@ -195,13 +231,16 @@ def _save(states: TrainState, members: list[Member], env_steps: int) -> None:
 
 def _check(states: TrainState, run: RunConfig, members: list[Member]) -> None:
     for i, member in enumerate(members):
-        update, term = int(states.fault_update[i]), int(states.fault_term[i])
-        if update >= 0:
+        if what := fault(states, i):
             latest = member.checkpoints.latest_step()
             kept = f"the checkpoint at step {latest:,} is kept" if latest else "no checkpoint had been made yet"
-            raise NotFinite(
-                f"{member.folder}: seed {run.seed + i}: {FAULT_TERMS[term]} is not finite in update {update:,}; {kept}"
-            )
+            raise NotFinite(f"{member.folder}: seed {run.seed + i}: {what}; {kept}")
+
+
+def fault(states: TrainState, member: int) -> str:
+    """What was first not finite in a member's training, and when; "" if nothing was."""
+    update, term = int(states.fault_update[member]), int(states.fault_term[member])
+    return f"{FAULT_TERMS[term]} is not finite in update {update:,}" if update >= 0 else ""
 
 
 def _rows(config: Config, states: TrainState, flights: Flights, clock: float, seconds: float) -> list[Row]:

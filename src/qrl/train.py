@@ -2,20 +2,23 @@
 
 Every value carries a leading member axis (one seed or grid point each). On a CPU members run one after the
 other inside the program (`lax.map`), which is faster there than batching small networks; elsewhere `vmap`.
+Several devices share the members out among themselves.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from qrl import buffer, evaluate, rollout
 from qrl.buffer import Ring
 from qrl.config import Config
-from qrl.learner import Learner, LearnerState, Terms
+from qrl.learner import Hyper, Learner, LearnerState, Terms, hyper
 from qrl.rollout import Lanes
 from qrl.types import Transition
 
@@ -46,74 +49,123 @@ class TrainState(NamedTuple):
     totals: Totals  # since the last report; whoever reports sets them to zero
 
 
-class Trainer:
-    """The compiled programs of one environment and configuration."""
+class Point(NamedTuple):
+    """What one program takes as arguments: members may differ in it, and in nothing else but their seed."""
 
-    def __init__(self, env: Env, config: Config) -> None:
+    hyper: Hyper
+    world: Any  # the environment's `params`; () of one that has none
+
+
+def point(env: Env, config: Config) -> Point:
+    """The point (NumPy, one member's) of an environment and a configuration."""
+    return Point(hyper(config), jax.tree.map(np.asarray, getattr(env, "params", ())))
+
+
+def stack(members: Sequence[Any]) -> Any:
+    """Members' values side by side: a leading member axis."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
+
+
+_MEMBERS, _ALL = PartitionSpec("member"), PartitionSpec()
+
+
+class Trainer:
+    """The compiled programs of one environment and configuration, for any values of what a `Point` holds.
+
+    init     (seeds [M], points [M])          -> states [M]
+    advance  (states [M], points [M], until)  -> states [M]; donates the states
+    fly      (learners [M], points [M], keys) -> Flights [M]
+
+    M must be a multiple of the number of `devices` (default: one).
+    """
+
+    def __init__(self, env: Env, config: Config, devices: Sequence[jax.Device] | None = None) -> None:
         self.env = env
         self.config = config
         self.longest = rollout.episode_steps(env, config.episode_steps)
         self.learner = Learner(config, int(env.observation_size), env.action_size)  # pyright: ignore[reportArgumentType]
+        self.mesh = Mesh(np.asarray(devices or jax.local_devices()[:1]), ("member",))
         # Run once, so compiled in haste: a third of the time.
         haste = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
-        self.init = jax.jit(lambda seeds: _over_members(self._init, seeds), compiler_options=haste)
-        self.advance = jax.jit(
-            lambda states, until: _over_members(lambda state: self._advance(state, until), states), donate_argnums=0
-        )
-        self.fly = jax.jit(lambda learners, keys: _over_members(lambda learner: self._fly(learner, keys), learners))
+        self.init = jax.jit(self._sharded(self._init, _MEMBERS, _MEMBERS), compiler_options=haste)
+        self.advance = jax.jit(self._sharded(self._advance, _MEMBERS, _MEMBERS, _ALL), donate_argnums=0)
+        self.fly = jax.jit(self._sharded(self._fly, _MEMBERS, _MEMBERS, _ALL))
 
-    def _init(self, seed: chex.Array) -> TrainState:
+    def _sharded(self, one: Callable[..., Any], *specs: PartitionSpec) -> Callable[..., Any]:
+        """`one`, written for one member, for all: `specs` says which arguments have a member axis."""
+
+        def many(*values: Any) -> Any:
+            members = tuple(v for v, spec in zip(values, specs, strict=True) if spec == _MEMBERS)
+            rest = values[len(members) :]
+            return _over_members(lambda member: one(*member, *rest), members)
+
+        # Members never look at each other, so nothing needs to be checked for agreement between devices.
+        return jax.shard_map(many, mesh=self.mesh, in_specs=specs, out_specs=_MEMBERS, check_vma=False)
+
+    def place(self, members: Any) -> Any:
+        """Values with a leading member axis, on the devices that work on them."""
+        return jax.device_put(members, NamedSharding(self.mesh, _MEMBERS))
+
+    def _under(self, point: Point) -> tuple[Learner, Env]:
+        under = getattr(self.env, "under", lambda _: self.env)
+        return self.learner.under(point.hyper), under(point.world)
+
+    def _init(self, seed: chex.Array, point: Point) -> TrainState:
+        learner, env = self._under(point)
         learner_key, lanes_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
-        lanes = rollout.begin(self.env, lanes_key, self.config.lanes, self.longest, self.config.unroll_steps)
-        learner = self.learner.init(learner_key)
-        _, transitions = jax.eval_shape(self._collect, learner, lanes, key)
+        lanes = rollout.begin(env, lanes_key, self.config.lanes, self.longest, self.config.unroll_steps)
+        first = learner.init(learner_key)
+        _, transitions = jax.eval_shape(lambda *now: self._collect(learner, *now), first, lanes, key)
         ring = buffer.create(transitions, self.config.ring_unrolls)
         zero = jnp.float32(0.0)
         totals = Totals(zero, zero, zero, zero, zero, Terms(*[zero] * len(Terms._fields)))
-        return TrainState(learner, ring, lanes, key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
+        return TrainState(first, ring, lanes, key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
 
-    def _collect(self, learner: LearnerState, lanes: Lanes, key: chex.PRNGKey) -> tuple[Lanes, Transition]:
+    def _collect(
+        self, learner: Learner, state: LearnerState, lanes: Lanes, key: chex.PRNGKey
+    ) -> tuple[Lanes, Transition]:
         return rollout.unroll(
-            self.env,
+            self.env,  # of any parameters: each lane carries its own
             lanes,
-            lambda observation: self.learner.mean(learner, observation),
-            self.learner.sigma(learner),
+            lambda observation: learner.mean(state, observation),
+            learner.sigma(state),
             key,
             unroll_steps=self.config.unroll_steps,
             longest=self.longest,
         )
 
-    def _advance(self, state: TrainState, until: chex.Array) -> TrainState:
+    def _advance(self, state: TrainState, point: Point, until: chex.Array) -> TrainState:
         """Go on until `until` unrolls have been made; where it pauses on the way changes nothing."""
-        return jax.lax.fori_loop(state.unrolls, until, lambda _, state: self._unroll_and_learn(state), state)
+        learner, _ = self._under(point)
+        return jax.lax.fori_loop(state.unrolls, until, lambda _, state: self._unroll_and_learn(learner, state), state)
 
-    def _unroll_and_learn(self, state: TrainState) -> TrainState:
+    def _unroll_and_learn(self, learner: Learner, state: TrainState) -> TrainState:
         collect_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
-        lanes, transitions = self._collect(state.learner, state.lanes, collect_key)
-        learner = self.learner.observe(state.learner, transitions.observation)
+        lanes, transitions = self._collect(learner, state.learner, state.lanes, collect_key)
+        observed = learner.observe(state.learner, transitions.observation)
         ring = buffer.add(state.ring, transitions)
 
-        def update(learner: LearnerState, index: chex.Array) -> tuple[LearnerState, Terms]:
-            return self.learner.update(learner, buffer.gather(ring, index))
+        def update(now: LearnerState, index: chex.Array) -> tuple[LearnerState, Terms]:
+            return learner.update(now, buffer.gather(ring, index))
 
-        def learn(learner: LearnerState) -> tuple[LearnerState, Terms]:
+        def learn(now: LearnerState) -> tuple[LearnerState, Terms]:
             minibatches = (self.config.updates_per_unroll, self.config.minibatch_lanes)
-            return jax.lax.scan(update, learner, buffer.draw(ring, learn_key, minibatches))
+            return jax.lax.scan(update, now, buffer.draw(ring, learn_key, minibatches))
 
-        def wait(learner: LearnerState) -> tuple[LearnerState, Terms]:
+        def wait(now: LearnerState) -> tuple[LearnerState, Terms]:
             zeros = jnp.zeros(self.config.updates_per_unroll)
-            return learner, Terms(*[zeros] * len(Terms._fields))
+            return now, Terms(*[zeros] * len(Terms._fields))
 
         warm = state.unrolls + 1 >= self.config.warmup_unrolls
-        learned, terms = jax.lax.cond(warm, learn, wait, learner)
-        fault_update, fault_term = self._fault(transitions, terms, learner.updates)
+        learned, terms = jax.lax.cond(warm, learn, wait, observed)
+        fault_update, fault_term = self._fault(transitions, terms, observed.updates)
         fresh = (state.fault_update < 0) & (fault_update >= 0)
         seen = Totals(
             rewards=jnp.sum(transitions.reward),
             steps=jnp.float32(self.config.unroll_size),
             episodes=jnp.sum(transitions.terminated + transitions.truncated),
             early=jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32),
-            updates=(learned.updates - learner.updates).astype(jnp.float32),
+            updates=(learned.updates - observed.updates).astype(jnp.float32),
             terms=jax.tree.map(jnp.sum, terms),
         )
         return TrainState(
@@ -138,9 +190,10 @@ class Trainer:
         ok = jnp.all(finite)
         return jnp.where(ok, -1, updates + update), jnp.where(ok, -1, term)
 
-    def _fly(self, learner: LearnerState, keys: chex.PRNGKey) -> evaluate.Flights:
-        shipped = self.learner.shipped(learner)
-        return evaluate.fly(self.env, lambda observation: self.learner.mean(shipped, observation), keys, self.longest)
+    def _fly(self, state: LearnerState, point: Point, keys: chex.PRNGKey) -> evaluate.Flights:
+        learner, env = self._under(point)
+        shipped = learner.shipped(state)
+        return evaluate.fly(env, lambda observation: learner.mean(shipped, observation), keys, self.longest)
 
 
 def _over_members(one: Callable[[Any], Any], members: Any) -> Any:
