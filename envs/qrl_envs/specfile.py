@@ -108,7 +108,7 @@ def _first_line(error: ValidationError, kind: Any) -> str:
         return f"key '{key}': expected one of {expected}, found {json.dumps(context.get('tag'))}"
     key = ".".join(path)
     if problem["type"] == "extra_forbidden":
-        return f"unknown key '{key}'{nearest(path[-1], list(model.model_fields)) if model else ''}"
+        return f"unknown key '{key}'{nearest(path[-1], _names(model)) if model else ''}"
     if problem["type"] == "missing":
         return f"key '{key}' is missing"
     if problem["type"] == "value_error":  # our own validators say what they found themselves
@@ -117,6 +117,11 @@ def _first_line(error: ValidationError, kind: Any) -> str:
     message = problem["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
     message = message[0].lower() + message[1:]
     return f"{f'key {key!r}: ' if key else ''}{message}, found {found if len(found) < 60 else found[:57] + '...'}"
+
+
+def _names(model: type[BaseModel]) -> list[str]:
+    """Its keys as a file writes them."""
+    return [field.alias or name for name, field in model.model_fields.items()]
 
 
 def _models(kind: Any) -> list[type[BaseModel]]:

@@ -45,6 +45,13 @@ def count(text: str) -> int:
     return value
 
 
+def positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise ValueError
+    return value
+
+
 def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser = _Parser(prog="qrl", description="From a vehicle and a task to a policy that flies.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -64,6 +71,19 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts", allow_abbrev=False)
     evaluate.add_argument("run", type=Path, help="run folder", metavar="RUN")
     evaluate.add_argument("--starts", type=count, default=1000, help="how many starts (1000)", metavar="N")
+
+    sweep = commands.add_parser(
+        "sweep", help="train every point of a grid; the same command goes on", allow_abbrev=False
+    )
+    sweep.add_argument("grid", type=Path, help="a grid file, such as experiments/pendulum_lr.json", metavar="GRID")
+    sweep.add_argument("--out", type=Path, help="folder of the results (runs/GRID)", metavar="FOLDER")
+    sweep.add_argument(
+        "--memory-gb", type=positive, help="what the members may take (half of the devices' memory)", metavar="GB"
+    )
+    hosts = sweep.add_argument_group("several processes", "each told these, or by JAX's or SLURM's variables")
+    hosts.add_argument("--process-id", type=whole_number, help="which this is, from 0", metavar="I")
+    hosts.add_argument("--processes", type=count, help="how many there are", metavar="N")
+    hosts.add_argument("--coordinator", help="where process 0 can be reached", metavar="HOST:PORT")
 
     commands.add_parser("tasks", help="list the tasks that can be trained", allow_abbrev=False)
     args, unknown = parser.parse_known_args(argv)
@@ -93,6 +113,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
     elif args.command == "evaluate":
         print(f"qrl evaluate {args.run}: loading JAX and Brax", flush=True)
+    elif args.command == "sweep":
+        print(f"qrl sweep {args.grid}: loading JAX and Brax", flush=True)
     try:
         _load()
         from qrl import commands

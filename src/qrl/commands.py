@@ -1,24 +1,23 @@
-"""The commands behind the command line: train, evaluate, tasks."""
+"""The commands behind the command line: train, evaluate, tasks; sweep has a module of its own."""
 
 import argparse
 import json
 import shlex
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from qrl import loop, plots, request, runs
+from qrl import loop, plots, request, runs, sweep_command
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.runs import Row, RunConfig
+from qrl.terminal import clock, console, stop_requested
 from qrl.train import point, stack
 from qrl_envs import picture
 from qrl_envs import task as tasks
@@ -27,13 +26,12 @@ from qrl_envs.specfile import BadInput
 EVALUATION_STARTS_SEED = 1_000_003  # other starts than the reports'
 PICTURE_FLIGHTS = 5
 
-console = Console(highlight=False, markup=False, soft_wrap=True)
-
 
 def run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
     try:
-        return {"train": train, "evaluate": evaluate, "tasks": list_tasks}[args.command](args)
+        commands = {"train": train, "evaluate": evaluate, "sweep": sweep_command.sweep, "tasks": list_tasks}
+        return commands[args.command](args)
     except BadInput as error:
         complain(str(error))
         return WRONG_INPUT
@@ -84,7 +82,7 @@ def train(args: argparse.Namespace) -> int:
     _prepare(out, config, held)
     seeds = f"seed {config.seed}" if config.seeds == 1 else f"{config.seeds} seeds from {config.seed}"
     console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {config.devices[0]} -> {out}")
-    with _stop_requested() as stopped:
+    with stop_requested() as stopped:
         flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
         if flights is None:
             what = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
@@ -119,26 +117,6 @@ def _prepare(out: Path, config: RunConfig, held: bool) -> None:
         runs.write_json(out / "config.json", config.model_dump(mode="json"))
 
 
-@contextmanager
-def _stop_requested() -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C (or SIGTERM) came; a second Ctrl-C interrupts at once."""
-    asked = False
-
-    def ask(number: int, _: Any) -> None:
-        nonlocal asked
-        if asked and number == signal.SIGINT:
-            raise KeyboardInterrupt
-        asked = True
-        console.print("stopping: saving first")
-
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
 def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
     """Show what happens, a line a report; returns the flights of a run that came to its end."""
     flights, started = None, time.perf_counter()
@@ -154,7 +132,7 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
                 compiling = event.what
                 console.print(f"compiling {event.what} ({time.perf_counter() - started:.1f} s)")
             elif isinstance(event, loop.Progress):
-                note = f"{event.steps_per_second:,.0f} steps/s, {_clock(event.seconds_left)} left"
+                note = f"{event.steps_per_second:,.0f} steps/s, {clock(event.seconds_left)} left"
                 bar.update(task, completed=event.env_steps, note=note)
             elif isinstance(event, loop.Finished):
                 flights = event.flights
@@ -171,7 +149,7 @@ def _line(rows: list[Row], seconds_left: float) -> str:
     first = rows[0]
     return (
         f"{first['env_steps']:>12,} {first['steps_per_second']:>10,.0f} {_spread(rows, 'return_mean', '.2f'):>20}"
-        f" {_spread(rows, 'success', '.3f'):>16} {_clock(first['train_seconds']):>8} {_clock(seconds_left):>7}"
+        f" {_spread(rows, 'success', '.3f'):>16} {clock(first['train_seconds']):>8} {clock(seconds_left):>7}"
     )
 
 
@@ -183,11 +161,6 @@ def _spread(rows: list[Row], name: str, form: str) -> str:
     if len(values) == 1:
         return format(values[0], form)
     return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"
-
-
-def _clock(seconds: float) -> str:
-    minutes, seconds = divmod(round(seconds), 60)
-    return f"{minutes}:{seconds:02d}"
 
 
 def _finish(out: Path, config: RunConfig, flights: Flights, seconds: float) -> None:
@@ -210,7 +183,7 @@ def _finish(out: Path, config: RunConfig, flights: Flights, seconds: float) -> N
             if (v := [row.get(name, float("nan")) for row in last])
         }
         runs.write_json(out / "summary.json", {"seeds": spread, "command_seconds": round(seconds, 1)})
-    console.print(f"done in {_clock(seconds)}: {out}/summary.json, learning_curve.png; next: make evaluate RUN={out}")
+    console.print(f"done in {clock(seconds)}: {out}/summary.json, learning_curve.png; next: make evaluate RUN={out}")
 
 
 def _task(config: RunConfig) -> tasks.Task:

@@ -1,7 +1,7 @@
 """One minibatch update: V-trace or GAE, the perceptron objective, the value loss, Adam (Algorithm 1)."""
 
 import copy
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -37,7 +37,7 @@ class Terms(NamedTuple):
     value_gradient: chex.Array
 
 
-Hyper = dict[str, chex.Array]  # the traced hyperparameters by name, float32: [], or [F] of observation_scale
+Hyper = dict[str, Any]  # the traced hyperparameters by name: float32 [], or [F] of observation_scale
 
 
 def hyper(config: Config) -> Hyper:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,9 @@ from tensorboardX import SummaryWriter
 from qrl import checkpoint, runs
 from qrl.config import Config
 from qrl.evaluate import Flights, summarise
+from qrl.learner import LearnerState
 from qrl.runs import Row, RunConfig
-from qrl.train import FAULT_TERMS, Totals, Trainer, TrainState, point, stack
+from qrl.train import FAULT_TERMS, Point, Totals, Trainer, TrainState, point, stack
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # how long the device works between two signs of life
@@ -73,10 +75,10 @@ class Lap:
 
 @dataclass(frozen=True)
 class Programs:
-    """What runs members: a trainer's programs, compiled for their number and bound to their points."""
+    """A trainer's programs, compiled for a number of members."""
 
-    advance: Callable[[TrainState, np.int32], TrainState]
-    fly: Callable[[TrainState], Flights]
+    advance: Callable[[TrainState, Point, np.int32], TrainState]
+    fly: Callable[[LearnerState, Point, jax.Array], Flights]
 
 
 @dataclass
@@ -114,18 +116,22 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
         if resume:
             states = _restore_latest(trainer, states, members)
         yield Compiling("training")
-        advance = trainer.advance.lower(states, points, np.int32(0)).compile()
+        advance = compile_advance(trainer, states, points)
         yield Compiling("evaluation")
-        starts = report_starts(run.learner)
-        fly = trainer.fly.lower(states.learner, points, starts).compile()
-        programs = Programs(
-            lambda states, until: advance(states, points, until), lambda states: fly(states.learner, points, starts)
-        )
-        yield from _advance_and_report(states, programs, run, members, stopped)
+        programs = Programs(advance, compile_fly(trainer, states, points))
+        yield from _advance_and_report(states, points, programs, run, members, stopped)
     finally:
         for member in members:
             member.writer.close()
             member.checkpoints.close()
+
+
+def compile_advance(trainer: Trainer, states: TrainState, points: Point) -> Any:
+    return trainer.advance.lower(states, points, np.int32(0)).compile()
+
+
+def compile_fly(trainer: Trainer, states: TrainState, points: Point) -> Any:
+    return trainer.fly.lower(states.learner, points, report_starts(trainer.config)).compile()
 
 
 def seeds(first: int, count: int) -> np.ndarray:
@@ -138,11 +144,16 @@ def report_starts(config: Config) -> jax.Array:
 
 
 def _advance_and_report(
-    states: TrainState, programs: Programs, run: RunConfig, members: list[Member], stopped: Callable[[], bool]
+    states: TrainState,
+    points: Point,
+    programs: Programs,
+    run: RunConfig,
+    members: list[Member],
+    stopped: Callable[[], bool],
 ) -> Iterator[Event]:
     lap, saved = None, True
     clock = members[0].rows[-1]["train_seconds"] if members[0].rows else 0.0
-    for lap in laps(states, programs, run.learner, clock, stopped):
+    for lap in laps(states, points, programs, run.learner, clock, stopped):
         states = lap.states
         _check(states, run, members)
         saved = bool(lap.rows)
@@ -155,24 +166,29 @@ def _advance_and_report(
         _save(states, members, lap.env_steps)
         yield Reported(lap.rows, lap.seconds_left)
     if int(states.unrolls[0]) == run.learner.unrolls:
-        yield Finished(programs.fly(states))
+        yield Finished(programs.fly(states.learner, points, report_starts(run.learner)))
     elif lap and not saved:
         _save(states, members, lap.env_steps)
 
 
 def laps(
-    states: TrainState, programs: Programs, config: Config, clock: float, stopped: Callable[[], bool]
+    states: TrainState,
+    points: Point,
+    programs: Programs,
+    config: Config,
+    clock: float,
+    stopped: Callable[[], bool],
 ) -> Iterator[Lap]:
     """Advance all members to the end or until `stopped()`, a lap about CHUNK_SECONDS; `clock`: seconds trained."""
     done = first = int(states.unrolls[0])
-    count = len(states.unrolls)
+    count, starts = len(states.unrolls), report_starts(config)
     began = time.perf_counter()
     since_report, chunk = 0.0, 1
     while done < config.unrolls and not stopped():
         report_at = min(config.unrolls, (done // config.unrolls_per_report + 1) * config.unrolls_per_report)
         until = min(report_at, done + chunk)
         lap = time.perf_counter()
-        states = jax.block_until_ready(programs.advance(states, np.int32(until)))
+        states = jax.block_until_ready(programs.advance(states, points, np.int32(until)))
         lap = time.perf_counter() - lap
         clock, since_report = clock + lap, since_report + lap
         chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))
@@ -181,7 +197,7 @@ def laps(
         left = (time.perf_counter() - began) / (done - first) * (config.unrolls - done)
         rows: list[Row] = []
         if done == report_at:
-            rows = _rows(config, states, programs.fly(states), clock, since_report)
+            rows = _rows(config, states, programs.fly(states.learner, points, starts), clock, since_report)
             states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
             since_report = 0.0
         yield Lap(states, done * config.unroll_size, speed, left, rows)

@@ -82,12 +82,17 @@ def run_config(
     )
 
 
+def preset(record: TaskRecord) -> dict[str, Any]:
+    """The learner's defaults for a task."""
+    name = record.spec["preset"] if record.spec else "default"
+    if name not in runs.presets():
+        raise BadInput(f"{record.name}: key 'preset': no preset '{name}'{specfile.nearest(name, runs.presets())}")
+    return runs.preset(name)
+
+
 def _learner(record: TaskRecord, config: Path | None, learner: dict[str, Any], flags: dict[str, Any]) -> Config:
-    preset = record.spec["preset"] if record.spec else "default"
-    if preset not in runs.presets():
-        raise BadInput(f"{record.name}: key 'preset': no preset '{preset}'{specfile.nearest(preset, runs.presets())}")
-    base = runs.preset(preset) | learner
-    file = f"{config}: learner" if config else f"preset {preset}"
+    base = preset(record) | learner
+    file = f"{config}: learner" if config else f"preset of {record.name}"
     try:
         return specfile.build(Config, base | flags, "command line")
     except BadInput:

@@ -1,6 +1,7 @@
 """The run folder's files: what was asked (config.json) and what happened (metrics.csv)."""
 
 import csv
+import io
 import json
 import math
 from importlib import metadata, resources
@@ -81,8 +82,13 @@ def members(out: Path, run: RunConfig) -> list[Path]:
 
 def write_json(path: Path, data: Any) -> None:
     """Write `data` whole or not at all."""
+    replace_text(path, json.dumps(_plain(data), indent=2) + "\n")
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file under another name and rename it: whoever reads sees the old one or the new one, whole."""
     temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(json.dumps(_plain(data), indent=2) + "\n", encoding="utf-8")
+    temporary.write_text(text, encoding="utf-8")
     temporary.replace(path)
 
 
@@ -113,12 +119,16 @@ def _number(cell: str) -> float | int:
 
 def write_metrics(folder: Path, rows: list[Row]) -> None:
     """Write metrics.csv anew: a few dozen rows, and so it is never half-written."""
-    temporary = folder / "metrics.csv.tmp"
-    with temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-        writer.writeheader()
-        writer.writerows(
-            {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
-            for row in rows
-        )
-    temporary.replace(folder / "metrics.csv")
+    replace_text(folder / "metrics.csv", csv_text(rows))
+
+
+def csv_text(rows: list[dict[str, Any]]) -> str:
+    """Rows of one header as CSV; NaN (not measured) is an empty cell."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(
+        {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+        for row in rows
+    )
+    return text.getvalue()

@@ -79,7 +79,7 @@ class Trainer:
     M must be a multiple of the number of `devices` (default: one).
     """
 
-    def __init__(self, env: Env, config: Config, devices: Sequence[jax.Device] | None = None) -> None:
+    def __init__(self, env: Env, config: Config, devices: Sequence[Any] | None = None) -> None:
         self.env = env
         self.config = config
         self.longest = rollout.episode_steps(env, config.episode_steps)

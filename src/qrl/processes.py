@@ -1,0 +1,73 @@
+"""The devices and hosts that a sweep has: every core of a CPU, and the other processes of the same command."""
+
+import os
+from collections.abc import Mapping
+from contextlib import suppress
+from typing import NamedTuple
+
+import jax
+
+from qrl_envs.specfile import BadInput
+
+
+class Process(NamedTuple):
+    """Which of how many processes this is, and where process 0 listens ("" where the launcher says so itself)."""
+
+    index: int
+    count: int
+    coordinator: str
+
+
+def this_process(index: int | None, count: int | None, coordinator: str | None, env: Mapping[str, str]) -> Process:
+    """From flags, else JAX's variables, else those of a SLURM step (`srun`); alone where nothing is said."""
+    # Not SLURM_NTASKS: it is set in a batch script too, where only one process runs.
+    step = env if "SLURM_STEP_NUM_TASKS" in env else {}
+    found = [
+        ("--process-id", index, env.get("JAX_PROCESS_ID"), step.get("SLURM_PROCID")),
+        ("--processes", count, env.get("JAX_NUM_PROCESSES"), step.get("SLURM_STEP_NUM_TASKS")),
+    ]
+    index, count = (_number(flag, next((v for v in values if v is not None), None)) for flag, *values in found)
+    coordinator = coordinator or env.get("JAX_COORDINATOR_ADDRESS") or ""
+    if count is None and index is None:
+        return Process(0, 1, "")
+    if count is None or index is None or index >= count:
+        raise BadInput(f"expected --process-id below --processes, found {index} of {count}")
+    if count > 1 and not coordinator and not step:
+        raise BadInput("--coordinator is missing: expected HOST:PORT, where process 0 can be reached")
+    return Process(index, count, coordinator)
+
+
+def _number(flag: str, value: int | str | None) -> int | None:
+    try:
+        return None if value is None else int(value)
+    except ValueError:
+        raise BadInput(f"{flag}: expected a number, found '{value}'") from None
+
+
+def join(process: Process) -> None:
+    """Meet the other processes, where there are any, and take a device for each core where the device is a CPU."""
+    told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
+    if not told:
+        with suppress(RuntimeError):  # JAX has begun already: the devices are what they are
+            jax.config.update("jax_num_cpu_devices", _cores())
+    if process.count > 1 and not jax.distributed.is_initialized():
+        where = {"coordinator_address": process.coordinator} if process.coordinator else {}
+        try:
+            jax.distributed.initialize(num_processes=process.count, process_id=process.index, **where)
+        except (RuntimeError, ValueError) as error:
+            raise OSError(f"process {process.index} of {process.count} cannot meet the others: {error}") from None
+
+
+def _cores() -> int:
+    """Those that this process may use: a scheduler may have given it a part of the machine."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def memory_bytes() -> float:
+    """The memory that a sweep takes where nobody says otherwise: half of what the devices have."""
+    first = jax.local_devices()[0]
+    if first.platform == "cpu":
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2
+    return (first.memory_stats() or {}).get("bytes_limit", 8e9) * len(jax.local_devices()) / 2

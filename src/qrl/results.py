@@ -1,0 +1,123 @@
+"""What a sweep found: a table, medians and quartiles over seeds, the best point, and a run that repeats it."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from qrl import runs
+from qrl.grid import Grid
+from qrl.runs import RunConfig
+from qrl.sweep import Result
+
+CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
+Finding = dict[str, Any]  # of one point: place, how many seeds diverged, quartiles of each number of the last report
+
+
+def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
+    """A row for each point and seed: the point's place, the seed, and its last report."""
+    rows = [
+        {**_label(grid, index), "diverged": result.diverged, **result.rows[-1]}
+        for index, result in sorted(results.items())
+    ]
+    return _squared(rows)
+
+
+def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
+    """Every report of every point and seed."""
+    return [
+        {**_label(grid, index), **{name: row[name] for name in CURVE}}
+        for index, result in sorted(results.items())
+        for row in result.rows
+    ]
+
+
+def _label(grid: Grid, index: int) -> dict[str, Any]:
+    point, seed = divmod(index, len(grid.seeds))
+    place = {name: _cell(value) for name, value in grid.points[point].place.items()}
+    return {"point": point, **place, "seed": grid.seeds[seed]}
+
+
+def _cell(value: Any) -> Any:
+    return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
+
+
+def _squared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The same columns in every row: points of different tasks measure different things."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return [{name: row.get(name, math.nan) for name in names} for row in rows]
+
+
+def findings(grid: Grid, results: dict[int, Result]) -> list[Finding]:
+    """For each point the quartiles over its seeds; a seed that diverged counts as the worst there could be."""
+    found = []
+    for i, point in enumerate(grid.points):
+        seeds = [results[i * len(grid.seeds) + j] for j in range(len(grid.seeds))]
+        numbers = {
+            name: _quartiles([_worst(name) if seed.diverged else seed.rows[-1][name] for seed in seeds])
+            for name in seeds[0].rows[-1]
+            if name not in ("env_steps", "updates")
+        }
+        found.append({"point": i, "at": point.place, "diverged": sum(bool(s.diverged) for s in seeds), **numbers})
+    return found
+
+
+def _worst(name: str) -> float:
+    return {"success": 0.0, "return_mean": -math.inf, "return_min": -math.inf}.get(name, math.nan)
+
+
+def _quartiles(values: list[float]) -> dict[str, float]:
+    finite = np.asarray(values, np.float64)
+    with np.errstate(invalid="ignore"):
+        low, median, high = np.quantile(finite, [0.25, 0.5, 0.75])
+    if np.isneginf(finite).any():  # between the worst and a number lies no number: the worst
+        low, median, high = (-math.inf if math.isnan(q) else q for q in (low, median, high))
+    return {"median": float(median), "q1": float(low), "q3": float(high)}
+
+
+def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | None:
+    """The point of the highest median success and, among equals, median return; None if all diverged."""
+    alive = [finding for finding in found if finding["diverged"] < seeds]
+    return max(alive, key=_rank)["point"] if alive else None
+
+
+def _rank(finding: Finding) -> tuple[float, float]:
+    return tuple(_number(finding[name]["median"]) for name in ("success", "return_mean"))
+
+
+def _number(value: float) -> float:
+    return -math.inf if math.isnan(value) else value  # not measured
+
+
+def ranked(found: list[Finding]) -> list[Finding]:
+    """Best first."""
+    return sorted(found, key=_rank, reverse=True)
+
+
+def repeat(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
+    """The run of a point with its middle seed: the lower median, of those that did not diverge."""
+    first = point * len(grid.seeds)
+    last = {j: results[first + j].rows[-1] for j in range(len(grid.seeds)) if not results[first + j].diverged}
+    order = sorted(last, key=lambda j: (_number(last[j]["success"]), _number(last[j]["return_mean"])))
+    return RunConfig(
+        task=grid.points[point].task,
+        learner=grid.points[point].learner,
+        seed=grid.seeds[order[(len(order) - 1) // 2]],
+        seeds=1,
+        versions=runs.versions(),
+        devices=[str(device) for device in jax.local_devices()],
+    )
+
+
+def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Finding], seconds: float) -> None:
+    """results.csv, curves.csv, best.json and, last, summary.json."""
+    runs.replace_text(out / "results.csv", runs.csv_text(table(grid, results)))
+    runs.replace_text(out / "curves.csv", runs.csv_text(curves(grid, results)))
+    winner = best(found, results, len(grid.seeds))
+    if winner is not None:
+        runs.write_json(out / "best.json", repeat(grid, results, winner).model_dump(mode="json"))
+    summary = {"best": winner, "programs": len(grid.groups()), "points": found, "command_seconds": round(seconds, 1)}
+    runs.write_json(out / "summary.json", summary)

@@ -1,0 +1,189 @@
+"""The command `sweep`: a grid file to a folder of results; the same command goes on with an interrupted one."""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.progress import BarColumn, Progress, TextColumn
+
+from qrl import grid as grids
+from qrl import processes, request, results, runs, sweep_plot
+from qrl import sweep as members_of
+from qrl.exits import DONE, FAILED, complain
+from qrl.grid import Grid
+from qrl.processes import Process
+from qrl.sweep import ChunkDone, Compiling, Group, Member
+from qrl.terminal import clock, console, stop_requested
+from qrl.train import Trainer, point
+from qrl_envs.specfile import BadInput, read
+
+SHOWN = 20  # points in the table on the terminal
+POLL_SECONDS = 0.5  # between two looks at what the other processes have finished
+
+
+def sweep(args: argparse.Namespace) -> int:
+    began = time.perf_counter()
+    process = processes.this_process(args.process_id, args.processes, args.coordinator, os.environ)
+    processes.join(process)
+    budget = args.memory_gb * 1e9 if args.memory_gb is not None else processes.memory_bytes()
+    grid = grids.load(args.grid, budget)
+    out: Path = args.out or Path("runs") / args.grid.stem
+    held = _held(out, grid)
+    if held and (out / "summary.json").exists():
+        console.print(f"{out}: finished already; nothing to do")
+        return DONE
+    groups = _groups(grid, process, budget, args.grid)
+    _prepare(out, grid, process, held)
+    total = len(grid.points) * len(grid.seeds)
+    console.print(
+        f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
+        f" program{'s' * (len(groups) > 1)}, on {len(jax.local_devices())} × {jax.local_devices()[0].platform} -> {out}"
+    )
+    with stop_requested("stopping: finished chunks are kept") as stopped:
+        _follow(groups, out, process, stopped)
+        found = _all_results(out, total, process, stopped)
+    if found is None:
+        console.print("stopped; the same command goes on")
+        return FAILED
+    if process.index:
+        return DONE  # process 0 writes the results
+    return _finish(out, grid, found, args.grid.stem, time.perf_counter() - began)
+
+
+def _held(out: Path, grid: Grid) -> bool:
+    """Whether `out` holds this sweep already; BadInput if it holds something else."""
+    if out.exists() and not out.is_dir():
+        raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
+    if (out / "config.json").exists():
+        raise BadInput(f"{out}: holds a run; give another OUT")
+    path = out / "grid.json"
+    if not path.exists():
+        return False
+    stored = {key: value for key, value in read(path).items() if key not in ("versions", "devices")}
+    if stored != json.loads(json.dumps(grid.record)):
+        raise BadInput(f"{out}: holds a sweep of another grid ({path}); give another OUT")
+    return True
+
+
+def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Group]:
+    """This process's members of every program. Every n-th, whatever is finished: so no two make the same one."""
+    groups = []
+    for indices in grid.groups():
+        first = grid.points[indices[0]]
+        env = request.environment(first.task)
+        request.check(env, first.learner)
+        points = {i: point(request.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
+        members = [
+            Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
+        ]
+        mine = members[process.index :: process.count]
+        trainer = Trainer(env, first.learner, jax.local_devices())
+        each = members_of.member_bytes(trainer, members[0].point)
+        chunk = members_of.chunk_members(max(1, len(mine)), each, budget, len(jax.local_devices()))
+        if not chunk:
+            need = each * len(jax.local_devices())
+            raise BadInput(
+                f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
+                f" (such as {grids.said(first.place)}) that need {need / 1e9:,.2g} GB for one member on each device"
+            )
+        groups.append(Group(trainer, mine, chunk))
+    return groups
+
+
+def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
+    (out / "chunks").mkdir(parents=True, exist_ok=True)
+    if not held and process.index == 0:
+        devices = [str(device) for device in jax.devices()]
+        runs.write_json(out / "grid.json", {**grid.record, "versions": runs.versions(), "devices": devices})
+
+
+def _follow(groups: list[Group], out: Path, process: Process, stopped: Callable[[], bool]) -> None:
+    """Run every group, and show how far it is: a line a chunk, and a bar in between."""
+    work = sum(len(group.members) * group.steps for group in groups)
+    kept = members_of.finished(out / "chunks")
+    done = before = sum(group.steps for group in groups for m in group.members if m.index in kept)
+    count, total = len(kept), sum(len(group.members) for group in groups)
+    began = time.perf_counter()
+
+    def left(now: float) -> str:
+        spent = time.perf_counter() - began
+        return clock(spent / (now - before) * (work - now)) if now > before else "–"
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        shown = bar.add_task("", total=work, completed=done, note="")
+        for number, group in enumerate(groups):
+            for event in members_of.run(group, out / "chunks", stopped):
+                if isinstance(event, Compiling):
+                    console.print(f"compiling program {number + 1} of {len(groups)}, {group.chunk} members at once")
+                elif isinstance(event, ChunkDone):
+                    done += len(event.results) * group.steps
+                    count += len(event.results)
+                    console.print(_line(event, count, total, left(done)))
+                else:
+                    now = done + event.members * event.share * group.steps
+                    bar.update(shown, completed=now, note=f"{count} of {total} members, {left(now)} left")
+
+
+def _line(event: ChunkDone, count: int, total: int, left: str) -> str:
+    sick = sum(bool(result.diverged) for result in event.results.values())
+    return (
+        f"{count:>6} of {total} members done, {clock(event.seconds)} for the last {len(event.results)},"
+        f" {left} left{f'; {sick} diverged' if sick else ''}"
+    )
+
+
+def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
+    """Every member's result, once all processes have made theirs; None if stopped before."""
+    found = members_of.finished(out / "chunks")
+    if len(found) < total and process.count > 1 and not stopped():
+        console.print(f"process {process.index}: waiting for the others")
+    while len(found) < total and process.count > 1 and not stopped():
+        time.sleep(POLL_SECONDS)
+        found = members_of.finished(out / "chunks")
+    return found if len(found) == total else None
+
+
+def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
+    findings = results.findings(grid, found)
+    sweep_plot.sweep(out / "sweep.png", findings, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
+    results.write(out, grid, found, findings, seconds)
+    _print_table(findings, len(grid.seeds))
+    if not (out / "best.json").exists():
+        complain(f"{out}: every member diverged; results.csv says where")
+        return FAILED
+    console.print(
+        f"done in {clock(seconds)}: {out}/results.csv, summary.json, sweep.png;"
+        f" the best point again: make train CONFIG={out}/best.json OUT=…"
+    )
+    return DONE
+
+
+def _print_table(findings: list[results.Finding], seeds: int) -> None:
+    """The best points, best first: median and quartiles over seeds."""
+    rows = [
+        [*(_cell(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
+        + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
+        for f in results.ranked(findings)[:SHOWN]
+    ]
+    rows.insert(0, [*findings[0]["at"], "return", "success", "diverged"])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        console.print("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+    if len(findings) > SHOWN:
+        console.print(f"… and {len(findings) - SHOWN:,} more in summary.json")
+
+
+def _cell(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _spread(quartiles: dict[str, float], form: str) -> str:
+    if quartiles["median"] != quartiles["median"]:
+        return "–"
+    return f"{quartiles['median']:{form}} [{quartiles['q1']:{form}} … {quartiles['q3']:{form}}]"
