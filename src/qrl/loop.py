@@ -105,16 +105,16 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
     Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept.
     """
     trainer = Trainer(env, run.learner)
-    points = trainer.place(stack([point(env, run.learner)] * run.seeds))
+    points = stack([point(env, run.learner)] * run.seeds)
     members = [
         Member(folder, checkpoint.manager(folder), SummaryWriter(str(folder / "tensorboard")), [])
         for folder in runs.members(out, run)
     ]
     try:
         yield Compiling("first state")
-        states = trainer.init(trainer.place(seeds(run.seed, run.seeds)), points)
+        states = trainer.init(seeds(run.seed, run.seeds), points)
         if resume:
-            states = _restore_latest(trainer, states, members)
+            states = _restore_latest(states, members)
         yield Compiling("training")
         advance = compile_advance(trainer, states, points)
         yield Compiling("evaluation")
@@ -217,7 +217,7 @@ def restore(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState
             raise FileNotFoundError(f"{folder}: no checkpoint")
         like = jax.eval_shape(trainer.init, seeds(0, 1), stack([point(env, run.learner)]))
         state = checkpoint.restore(saved, latest, _one(like))
-    return trainer, trainer.place(stack([state])), latest
+    return trainer, jax.tree.map(jnp.asarray, stack([state])), latest
 
 
 def _one(states: TrainState) -> TrainState:
@@ -225,7 +225,7 @@ def _one(states: TrainState) -> TrainState:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
 
 
-def _restore_latest(trainer: Trainer, states: TrainState, members: list[Member]) -> TrainState:
+def _restore_latest(states: TrainState, members: list[Member]) -> TrainState:
     """The last checkpoint that every seed has, later ones and later rows dropped; `states` where there is none."""
     common = set.intersection(*[set(member.checkpoints.all_steps()) for member in members])
     latest = max(common, default=0)
@@ -237,7 +237,7 @@ def _restore_latest(trainer: Trainer, states: TrainState, members: list[Member])
     if not latest:
         return states
     like = _one(states)
-    return trainer.place(stack([checkpoint.restore(member.checkpoints, latest, like) for member in members]))
+    return jax.tree.map(jnp.asarray, stack([checkpoint.restore(m.checkpoints, latest, like) for m in members]))
 
 
 def _save(states: TrainState, members: list[Member], env_steps: int) -> None:

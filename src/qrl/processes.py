@@ -1,9 +1,8 @@
-"""The devices and hosts that a sweep has: every core of a CPU, and the other processes of the same command."""
+"""What a sweep runs on: the devices, every core of a CPU, and the other processes of the same command."""
 
 import os
 from collections.abc import Mapping
-from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 
@@ -45,17 +44,23 @@ def _number(flag: str, value: int | str | None) -> int | None:
 
 
 def join(process: Process) -> None:
-    """Meet the other processes, where there are any, and take a device for each core where the device is a CPU."""
-    told = "JAX_NUM_CPU_DEVICES" in os.environ or "host_platform_device_count" in os.environ.get("XLA_FLAGS", "")
-    if not told:
-        with suppress(RuntimeError):  # JAX has begun already: the devices are what they are
-            jax.config.update("jax_num_cpu_devices", _cores())
+    """Meet the other processes, where there are any."""
     if process.count > 1 and not jax.distributed.is_initialized():
         where = {"coordinator_address": process.coordinator} if process.coordinator else {}
         try:
             jax.distributed.initialize(num_processes=process.count, process_id=process.index, **where)
         except (RuntimeError, ValueError) as error:
             raise OSError(f"process {process.index} of {process.count} cannot meet the others: {error}") from None
+
+
+def workers() -> list[Any]:
+    """The device of each worker: an accelerator has one; a CPU one for each core that this process may use.
+
+    A program of ours keeps about one core busy, and the CPU runs several programs at a time: they need no devices of
+    their own, and so the program is the one that a single run compiles, and its results are the same bits.
+    """
+    devices = jax.local_devices()
+    return devices if devices[0].platform != "cpu" else devices[:1] * _cores()
 
 
 def _cores() -> int:

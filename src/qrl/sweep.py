@@ -6,21 +6,26 @@ interrupted sweep, on however many devices or hosts, makes only the members that
 
 import json
 import math
+import threading
 import time
-from collections.abc import Callable, Generator, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Queue
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import SingleDeviceSharding
 
 from qrl import loop
 from qrl.runs import Row, replace_text
-from qrl.train import Point, Trainer, TrainState, stack
+from qrl.train import Point, Trainer, stack
 
-# On a CPU a device takes its members one after the other: more gain no speed, and are what an interruption loses.
-CPU_MEMBERS_PER_DEVICE = 8
+# A CPU takes the members of a chunk one after the other: more gain no speed, and are what an interruption loses.
+CPU_CHUNK = 8
 
 
 class Member(NamedTuple):
@@ -33,11 +38,10 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """Members that share one compiled program, and how many of them it takes at once."""
+    """Members that share one compiled program."""
 
     trainer: Trainer
     members: list[Member]
-    chunk: int
 
     @property
     def steps(self) -> int:
@@ -55,18 +59,19 @@ class Result(NamedTuple):
 
 @dataclass(frozen=True)
 class Compiling:
-    """About to compile a group's programs."""
+    """About to compile a group's programs for so many members at once."""
 
     group: Group
+    chunk: int
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A sign of life: how far the members of the chunk under way are, and of which group."""
+    """A sign of life: a worker's chunk has come this far."""
 
     group: Group
-    members: int
-    share: float
+    worker: int
+    env_steps: int  # of all its members
 
 
 @dataclass(frozen=True)
@@ -74,80 +79,126 @@ class ChunkDone:
     """A chunk is recorded."""
 
     group: Group
+    worker: int
     results: dict[int, Result]
     seconds: float
 
 
 def member_bytes(trainer: Trainer, point: Point) -> int:
-    """What a member needs on its device: its state, once more where the program writes it, and its flights."""
-    states = jax.eval_shape(trainer.init, loop.seeds(0, _devices(trainer)), stack([point] * _devices(trainer)))
-    flights = jax.eval_shape(
-        trainer.fly, states.learner, stack([point] * _devices(trainer)), loop.report_starts(trainer.config)
-    )
-    return (2 * _bytes(states) + _bytes(flights)) // _devices(trainer)
-
-
-def _devices(trainer: Trainer) -> int:
-    return trainer.mesh.size
+    """What a member needs: its state, once more where the program writes it, and its flights."""
+    seeds, points = _like([Member(0, 0, point)], 1, None)
+    states = jax.eval_shape(trainer.init, seeds, points)
+    flights = jax.eval_shape(trainer.fly, states.learner, points, loop.report_starts(trainer.config))
+    return 2 * _bytes(states) + _bytes(flights)
 
 
 def _bytes(tree: Any) -> int:
     return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
 
 
-def chunk_members(members: int, each_bytes: int, budget_bytes: float, devices: int) -> int:
-    """Members of one chunk: a multiple of the devices, within the budget, chunks as even as can be; 0: none fits."""
-    most = int(budget_bytes // each_bytes) // devices
+def chunk_members(members: int, each_bytes: int, budget_bytes: float, workers: int) -> int:
+    """Members of one chunk, so that every worker has one in memory, and chunks are even; 0: not even one fits."""
+    most = int(budget_bytes // (each_bytes * workers))
     if jax.default_backend() == "cpu":
-        most = min(most, CPU_MEMBERS_PER_DEVICE)
+        most = min(most, CPU_CHUNK)
     if most < 1:
         return 0
-    chunks = max(1, math.ceil(members / (most * devices)))
-    return math.ceil(members / (chunks * devices)) * devices
+    rounds = math.ceil(members / (most * workers))
+    return math.ceil(members / (rounds * workers))
 
 
-def run(group: Group, folder: Path, stopped: Callable[[], bool]) -> Iterator[Compiling | Progress | ChunkDone]:
-    """Train the members of a group that have no result yet, chunk by chunk; returns early once `stopped()`."""
+def run(
+    group: Group, devices: Sequence[Any], budget_bytes: float, folder: Path, stopped: Callable[[], bool]
+) -> Iterator[Compiling | Progress | ChunkDone]:
+    """Train the members of a group that have no result yet, a worker for each of `devices`, until `stopped()`.
+
+    A device may be named several times: a CPU runs a program on about one core, and takes several at a time.
+    """
     done = finished(folder)
     left = [member for member in group.members if member.index not in done]
-    programs = None
-    while left and not stopped():
-        members, left = left[: group.chunk], left[group.chunk :]
-        padded = members + [members[-1]] * (group.chunk - len(members))  # one program, one number of members
-        points = group.trainer.place(stack([member.point for member in padded]))
-        if programs is None:
-            yield Compiling(group)
-        states = group.trainer.init(group.trainer.place(np.asarray([m.seed for m in padded], np.int32)), points)
-        programs = programs or loop.Programs(
-            loop.compile_advance(group.trainer, states, points), loop.compile_fly(group.trainer, states, points)
-        )
-        began = time.perf_counter()
-        results = yield from _chunk(group, programs, states, points, members, stopped)
-        if results is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            _record(folder / f"{members[0].index:07d}.json", results)
-            yield ChunkDone(group, results, time.perf_counter() - began)
+    if not left or stopped():
+        return
+    size = chunk_members(len(left), member_bytes(group.trainer, left[0].point), budget_bytes, len(devices))
+    yield Compiling(group, size)
+    programs = {device: _compiled(group.trainer, left, size, device) for device in set(devices)}
+    chunks = deque(left[i : i + size] for i in range(0, len(left), size))
+    events: Queue[Any] = Queue()
+    halt = threading.Event()
+
+    def work(worker: int, device: Any) -> None:
+        try:
+            with suppress(IndexError):  # no chunk left
+                while not halt.is_set():
+                    for event in _chunk(group, programs[device], chunks.popleft(), size, device, folder, halt.is_set):
+                        events.put(event(worker))
+            events.put(None)
+        except BaseException as error:
+            events.put(error)
+
+    for worker, device in enumerate(devices):
+        threading.Thread(target=work, args=(worker, device), daemon=True).start()
+    working = len(devices)
+    try:
+        while working:
+            event = events.get()
+            if isinstance(event, BaseException):
+                raise event
+            working -= event is None
+            if stopped():
+                halt.set()
+            if event is not None:
+                yield event
+    finally:
+        halt.set()
+
+
+def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
+    """Shapes and types of the seeds and points of a chunk."""
+    sharding = SingleDeviceSharding(device) if device else None
+    points = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype, sharding=sharding), members[0].point
+    )
+    return jax.ShapeDtypeStruct((size,), np.int32, sharding=sharding), points
+
+
+def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, loop.Programs]:
+    """The first state's program and the others, for chunks of `size` members."""
+    seeds, points = _like(members, size, device)
+    states = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
+        jax.eval_shape(trainer.init, seeds, points),
+    )
+    programs = loop.Programs(loop.compile_advance(trainer, states, points), loop.compile_fly(trainer, states, points))
+    return trainer.init.lower(seeds, points).compile(), programs
 
 
 def _chunk(
     group: Group,
-    programs: loop.Programs,
-    states: TrainState,
-    points: Point,
+    programs: tuple[Any, loop.Programs],
     members: list[Member],
-    stopped: Callable[[], bool],
-) -> Generator[Progress, None, dict[int, Result] | None]:
-    """Train a chunk to its end; its results by member, or None if it was stopped on the way."""
+    size: int,
+    device: Any,
+    folder: Path,
+    halted: Callable[[], bool],
+) -> Iterator[Callable[[int], Progress | ChunkDone]]:
+    """Train a chunk and record it, unless `halted()` on the way; yields events that lack their worker."""
+    began = time.perf_counter()
+    padded = members + [members[-1]] * (size - len(members))  # one program, one number of members
+    points = jax.device_put(stack([member.point for member in padded]), device)
+    seeds = jax.device_put(np.asarray([member.seed for member in padded], np.int32), device)
+    states = programs[0](seeds, points)
     rows: list[list[Row]] = [[] for _ in members]
-    for lap in loop.laps(states, points, programs, group.trainer.config, 0.0, stopped):
-        states = lap.states
+    for lap in loop.laps(states, points, programs[1], group.trainer.config, 0.0, halted):
+        states, env_steps = lap.states, lap.env_steps * len(members)
         for kept, row in zip(rows, lap.rows, strict=False):  # what fills the chunk up is not kept
             share = {"train_seconds": round(row["train_seconds"] / len(members), 3)}
-            kept.append({key: v for key, v in (row | share).items() if key != "steps_per_second"})
-        yield Progress(group, len(members), lap.env_steps / group.steps)
-    if any(len(kept) == 0 or kept[-1]["env_steps"] < group.steps for kept in rows):
-        return None
-    return {member.index: Result(rows[i], loop.fault(states, i)) for i, member in enumerate(members)}
+            kept.append({key: value for key, value in (row | share).items() if key != "steps_per_second"})
+        yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
+    if all(kept and kept[-1]["env_steps"] == group.steps for kept in rows):
+        results = {member.index: Result(rows[i], loop.fault(states, i)) for i, member in enumerate(members)}
+        _record(folder / f"{members[0].index:07d}.json", results)
+        seconds = time.perf_counter() - began
+        yield lambda worker: ChunkDone(group, worker, results, seconds)
 
 
 def _record(path: Path, results: dict[int, Result]) -> None:

@@ -42,10 +42,11 @@ def sweep(args: argparse.Namespace) -> int:
     total = len(grid.points) * len(grid.seeds)
     console.print(
         f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
-        f" program{'s' * (len(groups) > 1)}, on {len(jax.local_devices())} × {jax.local_devices()[0].platform} -> {out}"
+        f" program{'s' * (len(groups) > 1)}, {len(processes.workers())} workers on {jax.local_devices()[0].platform}"
+        f" -> {out}"
     )
     with stop_requested("stopping: finished chunks are kept") as stopped:
-        _follow(groups, out, process, stopped)
+        _follow(groups, out, budget, stopped)
         found = _all_results(out, total, process, stopped)
     if found is None:
         console.print("stopped; the same command goes on")
@@ -81,17 +82,14 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
         members = [
             Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
         ]
-        mine = members[process.index :: process.count]
-        trainer = Trainer(env, first.learner, jax.local_devices())
-        each = members_of.member_bytes(trainer, members[0].point)
-        chunk = members_of.chunk_members(max(1, len(mine)), each, budget, len(jax.local_devices()))
-        if not chunk:
-            need = each * len(jax.local_devices())
+        trainer = Trainer(env, first.learner)
+        each, workers = members_of.member_bytes(trainer, members[0].point), len(processes.workers())
+        if not members_of.chunk_members(len(members), each, budget, workers):
             raise BadInput(
                 f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
-                f" (such as {grids.said(first.place)}) that need {need / 1e9:,.2g} GB for one member on each device"
+                f" (such as {grids.said(first.place)}) of which one for each worker needs {each * workers / 1e9:.2g} GB"
             )
-        groups.append(Group(trainer, mine, chunk))
+        groups.append(Group(trainer, members[process.index :: process.count]))
     return groups
 
 
@@ -102,7 +100,7 @@ def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
         runs.write_json(out / "grid.json", {**grid.record, "versions": runs.versions(), "devices": devices})
 
 
-def _follow(groups: list[Group], out: Path, process: Process, stopped: Callable[[], bool]) -> None:
+def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
     """Run every group, and show how far it is: a line a chunk, and a bar in between."""
     work = sum(len(group.members) * group.steps for group in groups)
     kept = members_of.finished(out / "chunks")
@@ -118,15 +116,18 @@ def _follow(groups: list[Group], out: Path, process: Process, stopped: Callable[
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         shown = bar.add_task("", total=work, completed=done, note="")
         for number, group in enumerate(groups):
-            for event in members_of.run(group, out / "chunks", stopped):
+            under_way: dict[int, int] = {}
+            for event in members_of.run(group, processes.workers(), budget, out / "chunks", stopped):
                 if isinstance(event, Compiling):
-                    console.print(f"compiling program {number + 1} of {len(groups)}, {group.chunk} members at once")
+                    console.print(f"compiling program {number + 1} of {len(groups)}, {event.chunk} members at once")
                 elif isinstance(event, ChunkDone):
+                    under_way.pop(event.worker, None)
                     done += len(event.results) * group.steps
                     count += len(event.results)
-                    console.print(_line(event, count, total, left(done)))
+                    console.print(_line(event, count, total, left(done + sum(under_way.values()))))
                 else:
-                    now = done + event.members * event.share * group.steps
+                    under_way[event.worker] = event.env_steps
+                    now = done + sum(under_way.values())
                     bar.update(shown, completed=now, note=f"{count} of {total} members, {left(now)} left")
 
 

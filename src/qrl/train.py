@@ -2,7 +2,6 @@
 
 Every value carries a leading member axis (one seed or grid point each). On a CPU members run one after the
 other inside the program (`lax.map`), which is faster there than batching small networks; elsewhere `vmap`.
-Several devices share the members out among themselves.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from qrl import buffer, evaluate, rollout
 from qrl.buffer import Ring
@@ -66,45 +64,29 @@ def stack(members: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
 
 
-_MEMBERS, _ALL = PartitionSpec("member"), PartitionSpec()
-
-
 class Trainer:
     """The compiled programs of one environment and configuration, for any values of what a `Point` holds.
 
     init     (seeds [M], points [M])          -> states [M]
     advance  (states [M], points [M], until)  -> states [M]; donates the states
     fly      (learners [M], points [M], keys) -> Flights [M]
-
-    M must be a multiple of the number of `devices` (default: one).
     """
 
-    def __init__(self, env: Env, config: Config, devices: Sequence[Any] | None = None) -> None:
+    def __init__(self, env: Env, config: Config) -> None:
         self.env = env
         self.config = config
         self.longest = rollout.episode_steps(env, config.episode_steps)
         self.learner = Learner(config, int(env.observation_size), env.action_size)  # pyright: ignore[reportArgumentType]
-        self.mesh = Mesh(np.asarray(devices or jax.local_devices()[:1]), ("member",))
         # Run once, so compiled in haste: a third of the time.
         haste = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
-        self.init = jax.jit(self._sharded(self._init, _MEMBERS, _MEMBERS), compiler_options=haste)
-        self.advance = jax.jit(self._sharded(self._advance, _MEMBERS, _MEMBERS, _ALL), donate_argnums=0)
-        self.fly = jax.jit(self._sharded(self._fly, _MEMBERS, _MEMBERS, _ALL))
-
-    def _sharded(self, one: Callable[..., Any], *specs: PartitionSpec) -> Callable[..., Any]:
-        """`one`, written for one member, for all: `specs` says which arguments have a member axis."""
-
-        def many(*values: Any) -> Any:
-            members = tuple(v for v, spec in zip(values, specs, strict=True) if spec == _MEMBERS)
-            rest = values[len(members) :]
-            return _over_members(lambda member: one(*member, *rest), members)
-
-        # Members never look at each other, so nothing needs to be checked for agreement between devices.
-        return jax.shard_map(many, mesh=self.mesh, in_specs=specs, out_specs=_MEMBERS, check_vma=False)
-
-    def place(self, members: Any) -> Any:
-        """Values with a leading member axis, on the devices that work on them."""
-        return jax.device_put(members, NamedSharding(self.mesh, _MEMBERS))
+        self.init = jax.jit(lambda *members: _over_members(self._init, members), compiler_options=haste)
+        self.advance = jax.jit(
+            lambda states, points, until: _over_members(lambda *m: self._advance(*m, until), (states, points)),
+            donate_argnums=0,
+        )
+        self.fly = jax.jit(
+            lambda learners, points, keys: _over_members(lambda *m: self._fly(*m, keys), (learners, points))
+        )
 
     def _under(self, point: Point) -> tuple[Learner, Env]:
         under = getattr(self.env, "under", lambda _: self.env)
@@ -196,5 +178,7 @@ class Trainer:
         return evaluate.fly(env, lambda observation: learner.mean(shipped, observation), keys, self.longest)
 
 
-def _over_members(one: Callable[[Any], Any], members: Any) -> Any:
-    return jax.lax.map(one, members) if jax.default_backend() == "cpu" else jax.vmap(one)(members)
+def _over_members(one: Callable[..., Any], members: tuple[Any, ...]) -> Any:
+    if jax.default_backend() == "cpu":
+        return jax.lax.map(lambda member: one(*member), members)
+    return jax.vmap(one)(*members)
