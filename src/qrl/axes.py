@@ -116,7 +116,7 @@ def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) 
         raise BadInput(f"{key}: expected {expected}, found {json.dumps(value)}")
     if span.count == 1:
         raise BadInput(f"{key}: expected a range of at least 2 values, found count 1")
-    return span if sampled else Axis(tuple(span.at(i / (span.count - 1)) for i in range(span.count or 0)))
+    return span if span.count is None else Axis(tuple(span.at(i / (span.count - 1)) for i in range(span.count)))
 
 
 def refuse_clashes(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:

@@ -153,7 +153,7 @@ def _point(
         settings |= axes[name].settings(name, value)
     learner = {name: value for name, value in settings.items() if not name.startswith("task.")}
     where = f"{where}: at {said(place)}"
-    spec = task.spec
+    spec: Any = task.spec
     for name, value in settings.items():
         if name.startswith("task."):
             spec = put(spec, name.split(".")[1:], value)

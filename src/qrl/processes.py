@@ -12,8 +12,8 @@ from qrl_envs.specfile import BadInput
 class Process(NamedTuple):
     """Which of how many processes this is, and where process 0 listens ("" where the launcher says so itself)."""
 
-    index: int
-    count: int
+    number: int
+    of: int
     coordinator: str
 
 
@@ -45,12 +45,11 @@ def _number(flag: str, value: int | str | None) -> int | None:
 
 def join(process: Process) -> None:
     """Meet the other processes, where there are any."""
-    if process.count > 1 and not jax.distributed.is_initialized():
-        where = {"coordinator_address": process.coordinator} if process.coordinator else {}
+    if process.of > 1 and not jax.distributed.is_initialized():
         try:
-            jax.distributed.initialize(num_processes=process.count, process_id=process.index, **where)
+            jax.distributed.initialize(process.coordinator or None, process.of, process.number)
         except (RuntimeError, ValueError) as error:
-            raise OSError(f"process {process.index} of {process.count} cannot meet the others: {error}") from None
+            raise OSError(f"process {process.number} of {process.of} cannot meet the others: {error}") from None
 
 
 def workers() -> list[Any]:

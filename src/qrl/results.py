@@ -85,7 +85,7 @@ def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | 
 
 
 def _rank(finding: Finding) -> tuple[float, float]:
-    return tuple(_number(finding[name]["median"]) for name in ("success", "return_mean"))
+    return _number(finding["success"]["median"]), _number(finding["return_mean"]["median"])
 
 
 def _number(value: float) -> float:

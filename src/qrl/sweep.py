@@ -31,7 +31,7 @@ CPU_CHUNK = 8
 class Member(NamedTuple):
     """One point with one seed."""
 
-    index: int  # in the whole sweep: point · seeds + seed's place
+    number: int  # in the whole sweep: point · seeds + seed's place
     seed: int
     point: Point
 
@@ -115,7 +115,7 @@ def run(
     A device may be named several times: a CPU runs a program on about one core, and takes several at a time.
     """
     done = finished(folder)
-    left = [member for member in group.members if member.index not in done]
+    left = [member for member in group.members if member.number not in done]
     if not left or stopped():
         return
     size = chunk_members(len(left), member_bytes(group.trainer, left[0].point), budget_bytes, len(devices))
@@ -195,8 +195,8 @@ def _chunk(
             kept.append({key: value for key, value in (row | share).items() if key != "steps_per_second"})
         yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
     if all(kept and kept[-1]["env_steps"] == group.steps for kept in rows):
-        results = {member.index: Result(rows[i], loop.fault(states, i)) for i, member in enumerate(members)}
-        _record(folder / f"{members[0].index:07d}.json", results)
+        results = {member.number: Result(rows[i], loop.fault(states, i)) for i, member in enumerate(members)}
+        _record(folder / f"{members[0].number:07d}.json", results)
         seconds = time.perf_counter() - began
         yield lambda worker: ChunkDone(group, worker, results, seconds)
 

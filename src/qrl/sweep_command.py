@@ -51,7 +51,7 @@ def sweep(args: argparse.Namespace) -> int:
     if found is None:
         console.print("stopped; the same command goes on")
         return FAILED
-    if process.index:
+    if process.number:
         return DONE  # process 0 writes the results
     return _finish(out, grid, found, args.grid.stem, time.perf_counter() - began)
 
@@ -89,13 +89,13 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
                 f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
                 f" (such as {grids.said(first.place)}) of which one for each worker needs {each * workers / 1e9:.2g} GB"
             )
-        groups.append(Group(trainer, members[process.index :: process.count]))
+        groups.append(Group(trainer, members[process.number :: process.of]))
     return groups
 
 
 def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
     (out / "chunks").mkdir(parents=True, exist_ok=True)
-    if not held and process.index == 0:
+    if not held and process.number == 0:
         devices = [str(device) for device in jax.devices()]
         runs.write_json(out / "grid.json", {**grid.record, "versions": runs.versions(), "devices": devices})
 
@@ -104,7 +104,7 @@ def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[],
     """Run every group, and show how far it is: a line a chunk, and a bar in between."""
     work = sum(len(group.members) * group.steps for group in groups)
     kept = members_of.finished(out / "chunks")
-    done = before = sum(group.steps for group in groups for m in group.members if m.index in kept)
+    done = before = sum(group.steps for group in groups for m in group.members if m.number in kept)
     count, total = len(kept), sum(len(group.members) for group in groups)
     began = time.perf_counter()
 
@@ -142,9 +142,9 @@ def _line(event: ChunkDone, count: int, total: int, left: str) -> str:
 def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
     """Every member's result, once all processes have made theirs; None if stopped before."""
     found = members_of.finished(out / "chunks")
-    if len(found) < total and process.count > 1 and not stopped():
-        console.print(f"process {process.index}: waiting for the others")
-    while len(found) < total and process.count > 1 and not stopped():
+    if len(found) < total and process.of > 1 and not stopped():
+        console.print(f"process {process.number}: waiting for the others")
+    while len(found) < total and process.of > 1 and not stopped():
         time.sleep(POLL_SECONDS)
         found = members_of.finished(out / "chunks")
     return found if len(found) == total else None

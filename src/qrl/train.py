@@ -79,14 +79,18 @@ class Trainer:
         self.learner = Learner(config, int(env.observation_size), env.action_size)  # pyright: ignore[reportArgumentType]
         # Run once, so compiled in haste: a third of the time.
         haste = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
-        self.init = jax.jit(lambda *members: _over_members(self._init, members), compiler_options=haste)
-        self.advance = jax.jit(
-            lambda states, points, until: _over_members(lambda *m: self._advance(*m, until), (states, points)),
-            donate_argnums=0,
-        )
-        self.fly = jax.jit(
-            lambda learners, points, keys: _over_members(lambda *m: self._fly(*m, keys), (learners, points))
-        )
+        self.init = jax.jit(self._init_all, compiler_options=haste)
+        self.advance = jax.jit(self._advance_all, donate_argnums=0)
+        self.fly = jax.jit(self._fly_all)
+
+    def _init_all(self, seeds: chex.Array, points: Point) -> TrainState:
+        return _over_members(lambda m: self._init(m[0], m[1]), (seeds, points))
+
+    def _advance_all(self, states: TrainState, points: Point, until: chex.Array) -> TrainState:
+        return _over_members(lambda m: self._advance(m[0], m[1], until), (states, points))
+
+    def _fly_all(self, learners: LearnerState, points: Point, keys: chex.PRNGKey) -> evaluate.Flights:
+        return _over_members(lambda m: self._fly(m[0], m[1], keys), (learners, points))
 
     def _under(self, point: Point) -> tuple[Learner, Env]:
         under = getattr(self.env, "under", lambda _: self.env)
@@ -178,7 +182,5 @@ class Trainer:
         return evaluate.fly(env, lambda observation: learner.mean(shipped, observation), keys, self.longest)
 
 
-def _over_members(one: Callable[..., Any], members: tuple[Any, ...]) -> Any:
-    if jax.default_backend() == "cpu":
-        return jax.lax.map(lambda member: one(*member), members)
-    return jax.vmap(one)(*members)
+def _over_members(one: Callable[[Any], Any], members: Any) -> Any:
+    return jax.lax.map(one, members) if jax.default_backend() == "cpu" else jax.vmap(one)(members)
