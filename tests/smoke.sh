@@ -7,7 +7,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export JAX_PLATFORMS=cpu
-unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS OUT RESUME CONFIG ARGS RUN
+unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS OUT RESUME CONFIG ARGS RUN GRID
 
 qrl=.venv/bin/qrl
 python=.venv/bin/python
@@ -111,9 +111,31 @@ pendulum_and_hover() {
   passes "resume hover, finished" make train TASK=hover SEED=3 OUT="$out/hover" RESUME=1 ARGS="$budget"
   [[ $(contents "$out/hover") == "$before" ]] || fail "resuming a finished run changed it"
 
+  sweep_pendulum
   refuses "a run folder that exists" "a run/hover" "$qrl" train hover --out "$out/hover"
   refuses "to resume with another seed" "[Ss]eed" "$qrl" train hover --seed 4 --out "$out/hover" --resume
   bad_input
+}
+
+sweep_pendulum() {
+  cat >"$work/grid.json" <<'JSON'
+{"task": "pendulum", "fixed": {"steps": 2e4, "reports": 2, "report_flights": 10},
+ "axes": {"learning_rate": {"from": 1e-3, "to": 1e-2, "count": 2, "spacing": "log"}, "task.rod.mass_kg": [1, 1.5]}, "seeds": 2}
+JSON
+  passes "sweep, four points of two seeds" make sweep GRID="$work/grid.json" OUT="$out/sweep"
+  [[ $(wc -l <"$out/sweep/results.csv") == 9 && -s $out/sweep/sweep.png ]] || fail "the sweep's results are not whole"
+  local before
+  before=$(contents "$out/sweep")
+  passes "the same sweep, finished" make sweep GRID="$work/grid.json" OUT="$out/sweep"
+  [[ $(contents "$out/sweep") == "$before" ]] || fail "going on with a finished sweep changed it"
+  passes "train the best point" make train CONFIG="$out/sweep/best.json" OUT="$out/best"
+  complete "$out/best"
+
+  refuses "make sweep without GRID" "GRID is missing" make sweep
+  sed 's/learning_rate/learning_rat/' "$work/grid.json" >"$work/typo_grid.json"
+  refuses "a misspelt axis" "typo_grid.json.*learning_rat.*learning_rate" "$qrl" sweep "$work/typo_grid.json" --out "$out/no"
+  refuses "another grid in its folder" "another grid" "$qrl" sweep experiments/pendulum_lr.json --out "$out/sweep"
+  refuses "a grid without room" "points.*GB" "$qrl" sweep "$work/grid.json" --out "$out/no" --memory-gb 1e-6
 }
 
 bad_input() {

@@ -18,7 +18,7 @@ from qrl_envs import specfile
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput, Spec
 
-POINT_BYTES = 20_000  # what the host keeps of a point: its settings, its task, its row (measured: 14 kB)
+POINT_BYTES = 20_000  # of host memory for each point: read (6 kB measured), its arrays, its record in grid.json
 
 
 class Sample(Spec):
@@ -96,7 +96,10 @@ def load(path: Path, budget_bytes: float) -> Grid:
     file = specfile.build(GridFile, specfile.read(path), str(path))
     if len(set(file.seeds)) < len(file.seeds):
         raise BadInput(f"{path}: key 'seeds': expected each seed once, found {list(file.seeds)}")
-    task = request.task_record(file.task)
+    try:
+        task = request.task_record(file.task)
+    except BadInput as error:
+        raise BadInput(f"{path}: key 'task': {error}") from None
     known = settable(task)
     axes = {
         name: axis(name, value, known, str(path), sampled=file.sample is not None) for name, value in file.axes.items()

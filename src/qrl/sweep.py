@@ -119,6 +119,7 @@ def run(
     if not left or stopped():
         return
     size = chunk_members(len(left), member_bytes(group.trainer, left[0].point), budget_bytes, len(devices))
+    folder.mkdir(parents=True, exist_ok=True)
     yield Compiling(group, size)
     programs = {device: _compiled(group.trainer, left, size, device) for device in set(devices)}
     chunks = deque(left[i : i + size] for i in range(0, len(left), size))

@@ -94,7 +94,7 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
 
 
 def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
-    (out / "chunks").mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
     if not held and process.number == 0:
         devices = [str(device) for device in jax.devices()]
         runs.write_json(out / "grid.json", {**grid.record, "versions": runs.versions(), "devices": devices})
