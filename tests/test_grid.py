@@ -22,6 +22,11 @@ def load(folder: Path, data: Any, budget: float = 1e9) -> grid.Grid:
     return grid.load(path, budget)
 
 
+def spec(point: grid.GridPoint) -> dict[str, Any]:
+    assert point.task.spec is not None
+    return point.task.spec
+
+
 def test_every_hyperparameter_is_declared_traced_or_static() -> None:
     """Once each; counts, shapes and choices can only be static, and what is traced is a number or numbers."""
     for name, field in Config.model_fields.items():
@@ -51,7 +56,7 @@ def test_points_are_the_product_of_the_axes(tmp_path: Path) -> None:
     """Every combination once, in the axes' order, laid over `fixed`, over the task's preset."""
     axes = {"gamma": [0.9, 0.95], "task.rod.mass_kg": [1.0, 2.0], "lanes": [8, 16]}
     found = load(tmp_path, {"task": "pendulum", "fixed": {"sigma": 0.7}, "axes": axes, "seeds": [3, 5]})
-    seen = [(p.learner.gamma, p.task.spec["rod"]["mass_kg"], p.learner.lanes) for p in found.points]
+    seen = [(p.learner.gamma, spec(p)["rod"]["mass_kg"], p.learner.lanes) for p in found.points]
     assert seen == list(itertools.product(*axes.values()))
     assert {(p.learner.sigma, p.learner.activation) for p in found.points} == {(0.7, "tanh")}
     assert found.seeds == (3, 5)
@@ -89,12 +94,12 @@ def test_samples_are_uniform_and_repeatable(tmp_path: Path) -> None:
 def test_a_path_reaches_into_the_vehicle(tmp_path: Path) -> None:
     """One motor by its number, all by *; what is not named stays, and the shipped task is not changed."""
     one = load(tmp_path, {"task": "hover", "axes": {"task.vehicle.motors.2.max_N": [5.0, 6.0]}})
-    assert [[m["max_N"] for m in p.task.spec["vehicle"]["motors"]] for p in one.points] == [
+    assert [[m["max_N"] for m in spec(p)["vehicle"]["motors"]] for p in one.points] == [
         [8.0, 8.0, 5.0, 8.0],
         [8.0, 8.0, 6.0, 8.0],
     ]
     every = load(tmp_path, {"task": "hover", "axes": {"task.vehicle.motors.*.max_N": [5.0, 6.0]}})
-    assert [m["max_N"] for m in every.points[0].task.spec["vehicle"]["motors"]] == [5.0] * 4
+    assert [m["max_N"] for m in spec(every.points[0])["vehicle"]["motors"]] == [5.0] * 4
     assert len(one.groups()) == len(every.groups()) == 1
 
 

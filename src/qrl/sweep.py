@@ -97,8 +97,11 @@ def _bytes(tree: Any) -> int:
 
 
 def chunk_members(members: int, each_bytes: int, budget_bytes: float, workers: int) -> int:
-    """Members of one chunk, so that every worker has one in memory, and chunks are even; 0: not even one fits."""
-    most = int(budget_bytes // (each_bytes * workers))
+    """Members of one chunk, so that every worker has one in memory, and chunks are even; 0: not even one fits.
+
+    A program needs room for its members and, as scratch, for about one more.
+    """
+    most = int(budget_bytes // (each_bytes * workers)) - 1
     if jax.default_backend() == "cpu":
         most = min(most, CPU_CHUNK)
     if most < 1:

@@ -87,7 +87,8 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
         if not members_of.chunk_members(len(members), each, budget, workers):
             raise BadInput(
                 f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
-                f" (such as {grids.said(first.place)}) of which one for each worker needs {each * workers / 1e9:.2g} GB"
+                f" (such as {grids.said(first.place)}) of which one for each worker"
+                f" needs {2 * each * workers / 1e9:.2g} GB"
             )
         groups.append(Group(trainer, members[process.number :: process.of]))
     return groups

@@ -87,7 +87,18 @@ class Trainer:
         return _over_members(lambda m: self._init(m[0], m[1]), (seeds, points))
 
     def _advance_all(self, states: TrainState, points: Point, until: chex.Array) -> TrainState:
-        return _over_members(lambda m: self._advance(m[0], m[1], until), (states, points))
+        if _in_turn():
+            return _over_members(lambda m: self._advance(m[0], m[1], until), (states, points))
+        # All members are equally far, and their counters stay without a member axis: batched, they would turn every
+        # insert into the ring into a scatter, and the loop into a selection over the whole state.
+        axes: Any = TrainState(*[0] * len(TrainState._fields))._replace(ring=Ring(0, None), unrolls=None)  # pyright: ignore[reportArgumentType]
+        members = states._replace(
+            unrolls=states.unrolls[0], ring=states.ring._replace(inserted=states.ring.inserted[0])
+        )
+        after = jax.vmap(self._advance, in_axes=(axes, 0, None), out_axes=axes)(members, points, until)
+        count = states.unrolls.shape
+        ring = after.ring._replace(inserted=jnp.broadcast_to(after.ring.inserted, count))
+        return after._replace(unrolls=jnp.broadcast_to(after.unrolls, count), ring=ring)
 
     def _fly_all(self, learners: LearnerState, points: Point, keys: chex.PRNGKey) -> evaluate.Flights:
         return _over_members(lambda m: self._fly(m[0], m[1], keys), (learners, points))
@@ -182,5 +193,10 @@ class Trainer:
         return evaluate.fly(env, lambda observation: learner.mean(shipped, observation), keys, self.longest)
 
 
+def _in_turn() -> bool:
+    """Whether members run one after the other, as is fastest on a CPU."""
+    return jax.default_backend() == "cpu"
+
+
 def _over_members(one: Callable[[Any], Any], members: Any) -> Any:
-    return jax.lax.map(one, members) if jax.default_backend() == "cpu" else jax.vmap(one)(members)
+    return jax.lax.map(one, members) if _in_turn() else jax.vmap(one)(members)
