@@ -307,6 +307,22 @@ def test_evaluation_flies_its_own_starts_and_reward() -> None:
     np.testing.assert_allclose(plan.env.params.reward, [1.0, 0.2, 0.2, 0.2])
 
 
+def test_the_pendulum_is_judged_alike_whatever_it_trains_with() -> None:
+    """By Pendulum-v1's starts and reward; a task file that does not say how it is judged: as it trains."""
+    other = {"start": {"angle_rad": 0.1}, "reward": {"w_torque_1_N2m2": 9.0}, "rod": {"mass_kg": 2.0}}
+    spec = task.from_data({"extend": "pendulum", **other}, "here")
+    judged = env.from_task(spec).evaluation().env
+    assert isinstance(judged, TaskEnv)
+    np.testing.assert_allclose(judged.params.start, [np.pi, 1.0])
+    np.testing.assert_allclose(judged.params.reward, [1.0, 0.1, 0.001])
+    assert judged.params.physics.mass_kg == 2.0
+    silent = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"start": None, "reward": None})})
+    judged = env.from_task(silent).evaluation().env
+    assert isinstance(judged, TaskEnv)
+    np.testing.assert_allclose(judged.params.start, [0.1, 1.0])
+    np.testing.assert_allclose(judged.params.reward, [1.0, 0.1, 9.0])
+
+
 def test_unknown_keyword_is_no_silent_default() -> None:
     """brax.envs.create passes its keywords on."""
     with pytest.raises(TypeError):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from qrl import runs
-from qrl.config import Config
-from qrl.learner import Learner, LearnerState
+from qrl.config import TRACED, Config
+from qrl.learner import Hyper, Learner, LearnerState, Terms, hyper
 from qrl.networks import log_density
 from qrl.types import Transition
 from qrl.vtrace import vtrace
@@ -164,3 +164,38 @@ def test_observation_statistics_standardise() -> None:
     seen = learner.scale(state, data)
     np.testing.assert_allclose(np.mean(seen, 0), 0.0, atol=1e-2)
     np.testing.assert_allclose(np.std(seen, 0), 1.0, atol=1e-2)
+
+
+@pytest.fixture(scope="module")
+def traced() -> tuple[Hyper, object]:
+    """Every hyperparameter that travels, and one compiled program of what they decide, half-way through a run."""
+    here = config(observation_scale=[1.0] * F, steps=64 * 50 * 4, gradient_clip=0.1, sigma=1.0, sigma_end=1.0)
+    learner, data = Learner(here, F, A), batch()
+    state = learner.init(jax.random.PRNGKey(1))._replace(updates=jnp.int32(learner.total_updates // 2))
+
+    @jax.jit
+    def decided(values: Hyper) -> tuple[LearnerState, Terms, jax.Array]:
+        other = learner.under(values)
+        return *other.update(state, data), other.sigma(state)
+
+    return hyper(here), decided
+
+
+@pytest.mark.parametrize("name", TRACED)
+def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, name: str) -> None:
+    """One compiled program, another value: another result. (None that is declared traced is a constant in it.)"""
+    values, decided = traced
+    if name == "xi":  # whether it is there at all is static
+        values = values | {"xi": np.float32(0.01)}
+    first, second = decided(values), decided(values | {name: np.float32(0.5) * values[name] + np.float32(1e-4)})
+    assert any(
+        np.any(np.asarray(a) != np.asarray(b)) for a, b in zip(*map(jax.tree.leaves, (first, second)), strict=True)
+    )
+
+
+def test_other_values_make_the_learner_that_has_them(traced: tuple) -> None:
+    """Under another configuration's values a learner does what one of that configuration does."""
+    changes = {"gamma": 0.9, "epsilon": 0.05, "sigma": 0.5, "learning_rate": 1e-3, "reward_scale": 0.3}
+    there, data = Learner(config(**changes), F, A), batch()
+    here = Learner(config(), F, A).under(hyper(there.config))
+    np.testing.assert_array_equal(losses(here, data), losses(there, data))

@@ -29,7 +29,7 @@ def this_process(index: int | None, count: int | None, coordinator: str | None, 
     coordinator = coordinator or env.get("JAX_COORDINATOR_ADDRESS") or ""
     if count is None and index is None:
         return Process(0, 1, "")
-    if count is None or index is None or index >= count:
+    if count is None or index is None or not 0 <= index < count:
         raise BadInput(f"expected --process-id below --processes, found {index} of {count}")
     if count > 1 and not coordinator and not step:
         raise BadInput("--coordinator is missing: expected HOST:PORT, where process 0 can be reached")

@@ -139,21 +139,25 @@ def run(
         except BaseException as error:
             events.put(error)
 
-    for worker, device in enumerate(devices):
-        threading.Thread(target=work, args=(worker, device), daemon=True).start()
+    threads = [threading.Thread(target=work, args=pair, daemon=True) for pair in enumerate(devices)]
+    for thread in threads:
+        thread.start()
     working = len(devices)
     try:
         while working:
             event = events.get()
             if isinstance(event, BaseException):
                 raise event
-            working -= event is None
             if stopped():
                 halt.set()
-            if event is not None:
+            if event is None:
+                working -= 1
+            else:
                 yield event
     finally:
         halt.set()
+        for thread in threads:  # to the end of its lap: Python must not end while it is inside XLA
+            thread.join()
 
 
 def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:

@@ -105,8 +105,9 @@ def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[],
     """Run every group, and show how far it is: a line a chunk, and a bar in between."""
     work = sum(len(group.members) * group.steps for group in groups)
     kept = members_of.finished(out / "chunks")
-    done = before = sum(group.steps for group in groups for m in group.members if m.number in kept)
-    count, total = len(kept), sum(len(group.members) for group in groups)
+    mine = [group.steps for group in groups for member in group.members if member.number in kept]
+    done = before = sum(mine)
+    count, total = len(mine), sum(len(group.members) for group in groups)
     began = time.perf_counter()
 
     def left(now: float) -> str:

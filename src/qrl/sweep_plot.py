@@ -88,17 +88,18 @@ def _heat_map(axes: Axes, found: Sequence[Finding], names: list[str], metric: st
         place = down.index(_label(f["at"][names[0]])), across.index(_label(f["at"][names[1]]))
         cells[place] = value if np.isfinite(value) else np.nan
     axes.set_facecolor("#BBBBBB")
-    image = axes.imshow(cells, aspect="auto", cmap="viridis")
+    low, high = (0.0, 1.0) if metric == "success" else (None, None)
+    image = axes.imshow(cells, aspect="auto", cmap="viridis", origin="lower", vmin=low, vmax=high)
     axes.figure.colorbar(image, ax=axes, label=NAMES[metric])
     axes.set_yticks(range(len(down)), down, parse_math=False)
     axes.set_xticks(range(len(across)), across, parse_math=False)
     axes.set_ylabel(names[0], parse_math=False)
     axes.set_xlabel(names[1], parse_math=False)
     if cells.size <= LABELLED:
-        middle = (np.nanmin(cells) + np.nanmax(cells)) / 2 if np.isfinite(cells).any() else 0.0
         for (i, j), value in np.ndenumerate(cells):
-            colour = INK if value > middle else "white"
-            axes.text(j, i, f"{value:.3g}", ha="center", va="center", fontsize=8, color=colour)
+            light = np.asarray(image.norm(np.array([value]))).item() > 0.6  # of viridis' two ends
+            colour = INK if light else "white"
+            axes.text(j, i, f"{value:.4g}", ha="center", va="center", fontsize=8, color=colour)
 
 
 def _numeric(found: Sequence[Finding], name: str) -> bool:
