@@ -19,10 +19,11 @@ from qrl import evaluate, loop, request, runs
 from qrl.evaluate import Flights, summarise
 from qrl.export import baseline, emit
 from qrl.export import kernel as integer
+from qrl.export.accuracy import Answer, accuracy
 from qrl.export.kernel import Kernel
 from qrl.export.prove import Proof, prove
 from qrl.export.quantise import Inexpressible, quantise, si_layers
-from qrl.export.report import Answer, Flown, Measured, accuracy, report
+from qrl.export.report import Flown, Measured, report
 from qrl.learner import MAX_NORMALISED
 from qrl.policy import Acted, Observed, Origin, Policy
 from qrl_envs import ports
@@ -221,15 +222,19 @@ def _measured(run: Run, policy: Policy, kernel: Kernel, starts: int, proof: Call
     def answer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return integer.step(kernel, observation)[1]
 
+    plain = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
+
+    def naive(observation: NDArray[np.float32]) -> NDArray[np.floating]:
+        return np.clip(baseline.infer(plain, baseline.to_int8(plain, observation)) * plain.act_scale, *policy.limits)
+
     integers = run.fly_with(policy, answer, keys)
     seen = np.asarray(floats.observations[:, :-1]).reshape(-1, floats.observations.shape[-1])
     seen = seen[np.isfinite(seen).all(axis=1)]
     some = _thinned(seen, SAMPLES)
-    plain = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
     tail = run.tail_steps()
     return Measured(
         accuracy=accuracy(policy, answer, seen),
-        naive=accuracy(policy, lambda o: baseline.infer(plain, baseline.to_int8(plain, o)) * plain.act_scale, some),
+        naive=accuracy(policy, naive, some),
         flown_float=flown(policy, floats, tail),
         flown_integer=flown(policy, integers, tail),
         proof=proof(),

@@ -1,19 +1,15 @@
 """What an export measured, which of its gates it met, and report.md."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from qrl.export.accuracy import Accuracy
 from qrl.export.kernel import Kernel, accumulator_bound
 from qrl.export.prove import Proof
 from qrl.policy import Policy
-
-CHUNK = 8192  # observations at a time: the intermediate arrays stay in the cache
-
-Answer = Callable[[NDArray[np.float32]], NDArray[np.floating]]
 
 
 class Flown(NamedTuple):
@@ -22,13 +18,6 @@ class Flown(NamedTuple):
     summary: dict[str, float]  # as `qrl evaluate` has it
     jitter: float  # mean change of an action from step to step over the tail, in full scales
     starts: int
-
-
-class Accuracy(NamedTuple):
-    """Error of the action on the float policy's own flights, in full scales (greatest less least action)."""
-
-    rmse: float
-    worst: float
 
 
 @dataclass(frozen=True)
@@ -54,17 +43,6 @@ class Measured:
     flown_float: Flown
     flown_integer: Flown
     proof: Proof
-
-
-def accuracy(policy: Policy, answer: Answer, observations: NDArray[np.float32]) -> Accuracy:
-    """Of `answer` (observations -> actions in SI units) against the float policy at observations [n, F]."""
-    low, high = policy.limits
-    squares, worst = 0.0, 0.0
-    for i in range(0, len(observations), CHUNK):
-        error = (answer(observations[i : i + CHUNK]) - policy(observations[i : i + CHUNK])) / (high - low)
-        squares += float(np.sum(error**2))
-        worst = max(worst, float(np.abs(error).max()))
-    return Accuracy((squares / (len(observations) * len(low))) ** 0.5, worst)
 
 
 def gates(measured: Measured) -> list[Gate]:
