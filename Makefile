@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate tasks test smoke lint FORCE
+.PHONY: help setup train evaluate export tasks test smoke lint FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -20,6 +20,7 @@ define HELP
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--steps 2e6"              any other flag of `qrl train`; `qrl train --help` lists them
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
+  make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
   make test                          the tests (ARGS="-k vtrace": any flag of pytest)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright
@@ -40,6 +41,7 @@ need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
 # A run's config.json names its own task.
 $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
+$(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
 
 train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
@@ -47,6 +49,10 @@ train: $(STAMP)
 
 evaluate: $(STAMP)
 	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(ARGS)
+
+# `export` is a directive of make itself where a line begins with it.
+$(or export): $(STAMP)
+	@exec $(QRL) export $(call quoted,$(RUN)) $(ARGS)
 
 tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)

@@ -3,7 +3,6 @@
 Without the cross compiler or QEMU the target's tests are skipped; QRL_REQUIRE_CROSS=1 makes that a failure.
 """
 
-import os
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from machines import EACH, EITHER, M0, M3, M4F, M7, need
 from qrl.export import baseline, targets
 from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, Outputs, ProofFailed
 
@@ -68,7 +68,6 @@ RNG = np.random.default_rng(0)
 OBS_F32 = RNG.integers(0, 2**32, (VECTORS, 18), np.uint32).view(np.float32)  # any bits: infinities and NaN among them
 OBS_I16 = RNG.integers(-(2**15), 2**15, (VECTORS - 7, 18), np.int16)
 ODD = 77  # the vector that faults wait for
-M0, M3, M4F, M7 = CORES
 
 
 def write(folder: Path, *faults: tuple[str, str], obs: int = 18, act: int = 4) -> Path:
@@ -81,31 +80,6 @@ def write(folder: Path, *faults: tuple[str, str], obs: int = 18, act: int = 4) -
     (folder / "qrl_policy.h").write_text(HEADER.format(obs=obs, act=act), encoding="utf-8")
     (folder / "qrl_policy.c").write_text(source, encoding="utf-8")
     return folder
-
-
-def need(missing: list[str]) -> None:
-    if missing and os.environ.get("QRL_REQUIRE_CROSS") == "1":
-        pytest.fail(f"QRL_REQUIRE_CROSS=1, and missing here: {', '.join(missing)}")
-    if missing:
-        pytest.skip(f"missing here: {', '.join(missing)}")
-
-
-@pytest.fixture
-def cross() -> None:
-    """For a test that runs on targets of its own choice."""
-    need(targets.missing_tools())
-
-
-@pytest.fixture
-def host() -> None:
-    need([] if targets.host_compiler() else ["a C compiler"])
-
-
-@pytest.fixture
-def core(request: pytest.FixtureRequest) -> Core | None:
-    """The core of EACH or EITHER, where this machine can run it; None is the host."""
-    request.getfixturevalue("cross" if request.param else "host")
-    return request.param
 
 
 class Case(NamedTuple):
@@ -145,10 +119,6 @@ def assert_sound(run: Outputs, *, statuses: bool = True) -> None:
     if statuses:
         np.testing.assert_array_equal(run.status, (OBS_F32[:, 0] > 0).astype(int))
     assert run.selftest == 0
-
-
-EACH = pytest.mark.parametrize("core", CORES, ids=[core.name for core in CORES], indirect=True)
-EITHER = pytest.mark.parametrize("core", [None, M0, M4F], ids=["host", "M0", "M4F"], indirect=True)
 
 
 @EACH
