@@ -82,9 +82,12 @@ def test_integers_are_close_to_float(sizes: tuple[int, ...], activation: str) ->
 def test_integers_are_close_on_flights_not_calibrated_on(activation: str) -> None:
     policy, kernel = policies.policy(HOVER, activation), policies.kernel(HOVER, activation)
     observations = fresh(HOVER)
-    error = full_scales(policy, reference.step(kernel, observations)[1], observations)
-    assert rmse(error) <= 0.005
-    assert np.abs(error).max() <= 0.05
+    status, action = reference.step(kernel, observations)
+    within = status == 0
+    assert within.mean() > 0.99
+    error = full_scales(policy, action[within], observations[within])
+    assert rmse(error) <= 0.003
+    assert np.abs(error).max() <= 0.025
 
 
 @EACH_POLICY
