@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate sweep tasks test smoke lint FORCE
+.PHONY: help setup train evaluate export sweep tasks test smoke lint FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -20,6 +20,7 @@ define HELP
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--steps 2e6"              any other flag of `qrl train`; `qrl train --help` lists them
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
+  make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
   make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
@@ -44,6 +45,7 @@ need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
 $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
 $(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/pendulum_lr.json)
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
+$(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
 
 train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
@@ -51,6 +53,10 @@ train: $(STAMP)
 
 evaluate: $(STAMP)
 	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(ARGS)
+
+# `export` is a directive of make itself where a line begins with it.
+$(or export): $(STAMP)
+	@exec $(QRL) export $(call quoted,$(RUN)) $(ARGS)
 
 sweep: $(STAMP)
 	@exec $(QRL) sweep $(call quoted,$(GRID)) $(call flag,--out,$(OUT)) $(ARGS)

@@ -1,7 +1,14 @@
-"""Programs of one shape are compiled once in a session: the tests share a compile cache that lives as long."""
+"""What tests share: programs of one shape are compiled once in a session, machines to run kernels on, a tiny run."""
+
+from pathlib import Path
 
 import jax
 import pytest
+
+from frontdoor import TINY, qrl
+from machines import need
+from qrl.export import targets
+from qrl.export.targets import Core
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -9,3 +16,29 @@ def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("xla")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@pytest.fixture
+def cross() -> None:
+    """For a test that runs on targets of its own choice."""
+    need(targets.missing_tools())
+
+
+@pytest.fixture
+def host() -> None:
+    need([] if targets.host_compiler() else ["a C compiler"])
+
+
+@pytest.fixture
+def core(request: pytest.FixtureRequest) -> Core | None:
+    """The core of EACH or EITHER, where this machine can run it; None is the host."""
+    request.getfixturevalue("cross" if request.param else "host")
+    return request.param
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a pendulum run of 400 steps. Add to it only what no other test would miss or find."""
+    out = tmp_path_factory.mktemp("runs") / "pendulum"
+    assert qrl("train", "pendulum", "--out", out, *TINY.split()) == 0
+    return out

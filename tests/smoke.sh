@@ -104,6 +104,11 @@ pendulum_and_hover() {
   complete "$out/pendulum/seed-0"
   complete "$out/pendulum/seed-1"
 
+  passes "export a seed" make export RUN="$out/pendulum/seed-0" ARGS="--starts 100 --vectors 500"
+  passes "build and run the exported example" make -C "$out/pendulum/seed-0/export/examples/bare_metal"
+  grep -q '^torque: ' "$log/stdout" || fail "the example gave no torque"
+  refuses "to export two seeds at once" "seed-0" "$qrl" export "$out/pendulum"
+
   passes "train hover" make train TASK=hover SEED=3 OUT="$out/hover" ARGS="$budget"
   complete "$out/hover"
   local before
@@ -141,10 +146,12 @@ JSON
 bad_input() {
   refuses "make train without TASK" "TASK is missing" make train
   refuses "make evaluate without RUN" "RUN is missing" make evaluate
+  refuses "make export without RUN" "RUN is missing" make export
   refuses "a misspelt task" "'hover'" "$qrl" train hoverr --out "$out/no"
   refuses "a misspelt flag" "--stepz.*--steps" "$qrl" train hover --stepz 10 --out "$out/no"
   refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --steps many --out "$out/no"
   refuses "a run that is not there" "nowhere" "$qrl" evaluate "$out/nowhere"
+  refuses "to export a run that is not there" "nowhere" "$qrl" export "$out/nowhere"
 
   echo '{"gama": 0.9}' >"$work/typo.json"
   refuses "a misspelt key" "typo.json.*gama" "$qrl" train hover --config "$work/typo.json" --out "$out/no"

@@ -80,6 +80,10 @@ class TaskEnv(Env):
         """A fresh start drawn with `rng` (a legacy or typed key)."""
         return self._begin(self.params, rng)
 
+    def meet(self, rng: chex.PRNGKey) -> State:
+        """A start from the envelope that a policy has to cope with once it leaves the simulator."""
+        return self.reset(rng)
+
     def restart(self, state: State, rng: chex.PRNGKey) -> State:
         """A fresh start that keeps the task carried by `state`."""
         return self._begin(state.pipeline_state.params, rng)
@@ -130,6 +134,9 @@ class QuadrotorEnv(TaskEnv):
         reward = rewards.from_spec(task.reward)
         params = Params(quadrotor.physics(task.vehicle), reward, quadrotor.start(task.start), bounds)
         super().__init__(task, params, observation_size=18, action_size=4)
+
+    def meet(self, rng: chex.PRNGKey) -> State:
+        return self._begin(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
 
     def _draw(self, params: Params, rng: chex.PRNGKey) -> quadrotor.Body:
         return quadrotor.draw(params.start, rng)

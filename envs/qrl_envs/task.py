@@ -57,6 +57,10 @@ class FlightStart(Spec):
     body_rate_rad_s: NonNegative
 
 
+# Wide enough for the paper's trial, which began at 6.7 m/s (its figure of a hovering trial).
+ENVELOPE = FlightStart(position_m=2.0, velocity_m_s=7.0, body_rate_rad_s=1.0)
+
+
 class Bounds(Spec):
     """Beyond these an episode ends early, as a truncation."""
 
@@ -129,6 +133,7 @@ class QuadrotorTask(Spec):
     episode_steps: Count
     vehicle: Vehicle
     start: FlightStart
+    envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for, whatever it trained on
     bounds: Bounds
     reward: FlightReward
     evaluation: FlightEvaluation

@@ -72,6 +72,13 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     evaluate.add_argument("run", type=Path, help="run folder", metavar="RUN")
     evaluate.add_argument("--starts", type=count, default=1000, help="how many starts (1000)", metavar="N")
 
+    export = commands.add_parser("export", help="emit a trained policy as a C kernel, proved", allow_abbrev=False)
+    export.add_argument("run", type=Path, help="run folder", metavar="RUN")
+    export.add_argument("--starts", type=count, default=1000, help="how many starts to fly it from (1000)", metavar="N")
+    export.add_argument(
+        "--vectors", type=count, default=2000, help="observations to hold the C against (2000)", metavar="N"
+    )
+
     sweep = commands.add_parser(
         "sweep", help="train every point of a grid; the same command goes on", allow_abbrev=False
     )
@@ -94,6 +101,8 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 def _load() -> None:
     """Import JAX and Brax (seconds on a cold disk), Brax's remarks kept off the screen; use the compile cache."""
+    # NumPy's products are small here; threads of its own would fight XLA's: an export took five times as long.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     warnings.filterwarnings("ignore", module=r"brax\..*")
     with contextlib.redirect_stdout(io.StringIO()):  # Brax prints which optional packages it does not find
         import jax
@@ -111,8 +120,8 @@ def main(argv: list[str] | None = None) -> int:
     args = _parse(argv)
     if args.command == "train":
         print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
-    elif args.command == "evaluate":
-        print(f"qrl evaluate {args.run}: loading JAX and Brax", flush=True)
+    elif args.command in ("evaluate", "export"):
+        print(f"qrl {args.command} {args.run}: loading JAX and Brax", flush=True)
     elif args.command == "sweep":
         print(f"qrl sweep {args.grid}: loading JAX and Brax", flush=True)
     try:

@@ -1,4 +1,4 @@
-"""The commands behind the command line: train, evaluate, tasks; sweep has a module of its own."""
+"""The commands behind the command line: train, evaluate, export, tasks; sweep has a module of its own."""
 
 import argparse
 import json
@@ -13,9 +13,13 @@ import jax
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn
 
-from qrl import loop, plots, request, runs, sweep_command
+from qrl import deploy, loop, plots, request, runs, sweep_command
+from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
+from qrl.export.kernel import PossibleOverflow
+from qrl.export.report import gates
+from qrl.export.targets import ProofFailed
 from qrl.runs import Row, RunConfig
 from qrl.terminal import clock, console, stop_requested
 from qrl.train import point, stack
@@ -23,19 +27,24 @@ from qrl_envs import picture
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
 
-EVALUATION_STARTS_SEED = 1_000_003  # other starts than the reports'
 PICTURE_FLIGHTS = 5
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
     try:
-        commands = {"train": train, "evaluate": evaluate, "sweep": sweep_command.sweep, "tasks": list_tasks}
+        commands = {
+            "train": train,
+            "evaluate": evaluate,
+            "export": export,
+            "sweep": sweep_command.sweep,
+            "tasks": list_tasks,
+        }
         return commands[args.command](args)
     except BadInput as error:
         complain(str(error))
         return WRONG_INPUT
-    except loop.NotFinite as error:
+    except (loop.NotFinite, PossibleOverflow, ProofFailed) as error:
         complain(str(error))
         return FAILED
     except OSError as error:
@@ -234,3 +243,29 @@ def _cell(name: str, value: float) -> str:
     if name == "env_steps":
         return f"{value:,}"
     return f"{value:.2f}" if name.startswith("return") else f"{value:.4f}"
+
+
+# -- export --------------------------------------------------------------------------------------------------
+
+
+def export(args: argparse.Namespace) -> int:
+    """Emit, prove and fly a run's integer policy; print gates and costs, leave it all in RUN/export."""
+    begun = time.perf_counter()
+    done = deploy.export(deploy.Run(args.run), args.starts, args.vectors, console.print)
+    proof = done.measured.proof
+    for name in proof.held:
+        console.print(f"held against the reference, bit for bit, on {proof.vectors:,} observations an entry: {name}")
+    for what in proof.missing:
+        console.print(f"NOT proved {what}")
+    for gate in gates(done.measured):
+        mark = "met" if gate.met else "MISSED"
+        console.print(f"{gate.name:<40} {gate.measured:>9.3g} {gate.unit:<20} bar {gate.bar:<6g} {mark}")
+    if proof.costs:
+        console.print(
+            f"{'instructions per inference':<27} {'float entry':>12} {'i16 entry':>10} {'flash':>8} {'stack':>7}"
+        )
+    for cost in proof.costs:
+        mean, mean_i16 = cost.step[0], cost.step_i16[0]
+        console.print(f"{cost.core:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {cost.flash:>6,} B {max(cost.stack):>5} B")
+    console.print(f"done in {clock(time.perf_counter() - begun)}: {done.folder}/qrl_policy.c, .h, report.md")
+    return DONE

@@ -19,12 +19,18 @@ class Flights(NamedTuple):
     actions: chex.Array  # [n, steps, A] clipped to [−1, 1]
 
 
-def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, longest: int) -> Flights:
+def fly(
+    env: Env,
+    mean: Callable[[chex.Array], chex.Array],
+    keys: chex.PRNGKey,
+    longest: int,
+    begin: Callable[[Env, chex.PRNGKey], State] = lambda env, keys: jax.vmap(env.reset)(keys),
+) -> Flights:
     """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
 
     `env` is the training environment; one with an `evaluation` (ours) is flown and measured as that says,
-    another for one episode of `longest` steps. A flight that ends early has nothing more to observe: its
-    NaNs make it a failure wherever it ended.
+    another for one episode of `longest` steps. `begin` draws the starts. A flight that ends early has nothing
+    more to observe: its NaNs make it a failure wherever it ended.
     """
     plan = getattr(env, "evaluation", lambda: None)()
     env, steps, return_steps, measure = plan or (env, longest, longest, None)
@@ -38,7 +44,7 @@ def fly(env: Env, mean: Callable[[chex.Array], chex.Array], keys: chex.PRNGKey, 
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
         return (held, total), (_seen(state), action)
 
-    state = jax.vmap(env.reset)(keys)
+    state = begin(env, keys)
     (state, returns), (observations, actions) = jax.lax.scan(step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps))
     observations = jnp.concatenate([observations, _seen(state)[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}

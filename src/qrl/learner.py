@@ -16,6 +16,8 @@ from qrl.objective import perceptron
 from qrl.types import Networks, Transition
 from qrl.vtrace import vtrace
 
+MAX_NORMALISED = 10.0  # standard deviations at which a standardised observation is clipped
+
 
 class LearnerState(NamedTuple):
     params: Networks
@@ -93,7 +95,7 @@ class Learner:
     def scale(self, state: LearnerState, observation: chex.Array) -> chex.Array:
         """Observations as the networks see them; [..., F] -> [..., F]."""
         if self.config.normalise_observations:
-            observation = statistics.normalize(observation, state.statistics, max_abs_value=10.0)
+            observation = statistics.normalize(observation, state.statistics, max_abs_value=MAX_NORMALISED)
         return observation * self.hyper["observation_scale"] if "observation_scale" in self.hyper else observation
 
     def mean(self, state: LearnerState, observation: chex.Array) -> chex.Array:

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import subprocess
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any, Literal
@@ -58,7 +59,23 @@ class RunConfig(BaseModel):
 
 
 def versions() -> dict[str, str]:
-    return {name: metadata.version(name) for name in _PACKAGES}
+    return {name: metadata.version(name) for name in _PACKAGES} | {"commit": commit()}
+
+
+def commit() -> str:
+    """The commit of the code that runs, "+" behind it where files have changed since; "unknown" outside a checkout."""
+    root = Path(__file__).parents[2]
+    try:
+        if not (root / ".git").exists():
+            return "unknown"
+        git = ["git", "-C", str(root)]
+        head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "--untracked-files=no"], capture_output=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 def preset(name: str) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""A policy as a microcontroller kernel: quantise -> integer reference -> C -> proof.  NumPy alone."""

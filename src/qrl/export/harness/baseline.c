@@ -1,0 +1,65 @@
+/* The same network written the plain way, behind the kernel's interface, to compare costs with:
+   qrl_policy_step is float32 with the C library's tanhf; qrl_policy_step_i16 is int8 with one scale for each tensor,
+   and its int16 arguments hold int8 values. */
+#include "qrl_policy.h"
+
+#include <math.h>
+
+struct layer {
+    int inputs, outputs;
+    const float *weight, *bias; /* weights [outputs][inputs] */
+    const int8_t *weight_i8;
+    const int32_t *bias_i32;
+    int32_t multiplier; /* an accumulator times this, shifted right, is the next tensor's int8 */
+    int shift;
+    const int8_t *table; /* of the activation, 256 entries; null: none */
+};
+
+#include "baseline_data.h"
+
+int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE])
+{
+    float values[2][WIDEST];
+    const float *x = obs;
+    for (int l = 0; l < LAYERS; l++) {
+        const struct layer *layer = &layers[l];
+        float *y = l == LAYERS - 1 ? act : values[l % 2];
+        for (int o = 0; o < layer->outputs; o++) {
+            float sum = layer->bias[o];
+            for (int i = 0; i < layer->inputs; i++) {
+                sum += layer->weight[o * layer->inputs + i] * x[i];
+            }
+            y[o] = l == LAYERS - 1 ? sum : ACTIVATION(sum);
+        }
+        x = y;
+    }
+    return 0;
+}
+
+int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE])
+{
+    int8_t values[2][WIDEST];
+    for (int i = 0; i < QRL_POLICY_OBS_SIZE; i++) {
+        values[0][i] = (int8_t)obs[i];
+    }
+    for (int l = 0; l < LAYERS; l++) {
+        const struct layer *layer = &layers[l];
+        const int8_t *x = values[l % 2];
+        int8_t *y = values[(l + 1) % 2];
+        for (int o = 0; o < layer->outputs; o++) {
+            int32_t sum = layer->bias_i32[o];
+            for (int i = 0; i < layer->inputs; i++) {
+                sum += layer->weight_i8[o * layer->inputs + i] * x[i];
+            }
+            int64_t scaled = ((int64_t)sum * layer->multiplier + ((int64_t)1 << (layer->shift - 1))) >> layer->shift;
+            int32_t y8 = scaled > 127 ? 127 : scaled < -127 ? -127 : (int32_t)scaled;
+            y[o] = layer->table ? layer->table[y8 + 128] : (int8_t)y8;
+        }
+    }
+    for (int o = 0; o < QRL_POLICY_ACT_SIZE; o++) {
+        act[o] = values[LAYERS % 2][o];
+    }
+    return 0;
+}
+
+int qrl_policy_selftest(void) { return 0; }

@@ -1,0 +1,283 @@
+"""Compiles an emitted kernel and runs it: on this machine, and, measured, on four Cortex-M.
+
+`harness/harness.c` runs both entries over files of observations, so that every output is at hand here, and ends with
+one line of text. What does not end with exactly one such line and a whole file of outputs raises `ProofFailed`.
+Each run has a folder of its own: several may go side by side.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+Floats = np.ndarray[tuple[int, ...], np.dtype[np.floating]]
+Ints = np.ndarray[tuple[int, ...], np.dtype[np.integer]]
+
+SOURCES = Path(__file__).parent / "harness"
+STRICT = (
+    "-std=c99",
+    "-pedantic",
+    "-Wall",
+    "-Wextra",
+    "-Werror",
+    "-Wconversion",
+    "-Wsign-conversion",
+    "-Wshadow",
+    "-O2",
+)
+FIRMWARE = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-ffast-math")  # what the least careful build does
+RELEASE = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")  # what sizes and counts are taken with
+TIMEOUT_S = 60.0
+CLOCK_ERROR = 8  # instructions by which one measured call may be off: two rounds of the loops around it
+KNOWN_ROUNDS = (1000, 12345)  # of the loop of known length that the harness times in each run
+GUARD = 0xA5  # each byte behind the outputs, as the harness left it
+
+
+class Core(NamedTuple):
+    """A QEMU machine; `tick` is the instructions in a tick of its SysTick under `-icount shift=0`."""
+
+    name: str
+    machine: str
+    flags: tuple[str, ...]
+    tick: float
+    flash_bytes: int
+    ram_bytes: int
+
+
+_KIB, _MIB = 1 << 10, 1 << 20
+_HARD = ("-mfloat-abi=hard", "-mthumb")
+CORES = (
+    Core("M0", "microbit", ("-mcpu=cortex-m0", "-mthumb"), 62.5, 256 * _KIB, 16 * _KIB),
+    Core("M3", "mps2-an385", ("-mcpu=cortex-m3", "-mthumb"), 40.0, 4 * _MIB, 4 * _MIB),
+    Core("M4F", "mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB),
+    Core("M7", "mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB),
+)
+
+
+class ProofFailed(RuntimeError):
+    """One line: what did not compile, run or end as it must."""
+
+
+class Outputs(NamedTuple):
+    """What a kernel answered to N float and M fixed-point observations."""
+
+    status: Ints  # int32 [N]
+    act: Floats  # float32 [N, A]
+    status_i16: Ints  # int32 [M]
+    act_i16: Ints  # int16 [M, A]
+    selftest: int
+
+
+class Counts(NamedTuple):
+    """Instructions of each call, to within CLOCK_ERROR, and the deepest stack of each entry, libraries included."""
+
+    f32: Floats  # float64 [N]
+    i16: Floats  # float64 [M]
+    selftest: float
+    stack_f32: int  # bytes
+    stack_i16: int
+    stack_selftest: int
+
+
+class Sizes(NamedTuple):
+    """Bytes of qrl_policy.o, and of the library code that it pulls in."""
+
+    text: int
+    data: int
+    bss: int
+    library: int
+
+
+def host_compiler() -> str | None:
+    return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+
+
+def missing_tools() -> list[str]:
+    """What `run_core` and `size` need and this machine lacks."""
+    missing = [
+        tool for tool in ("arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm") if not shutil.which(tool)
+    ]
+    if "arm-none-eabi-gcc" not in missing:
+        # A library that it does not have, the compiler names without a folder.
+        library = subprocess.run(
+            ["arm-none-eabi-gcc", "-print-file-name=libc.a"], capture_output=True, text=True, check=False
+        ).stdout.strip()
+        missing += [] if Path(library).is_absolute() else ["newlib (libnewlib-arm-none-eabi)"]
+    return missing
+
+
+def run_host(
+    kernel: Path,
+    work: Path,
+    flags: Sequence[str],
+    obs_f32: Floats,
+    obs_i16: Ints,
+    libraries: Sequence[str] = (),
+    timeout_s: float = TIMEOUT_S,
+) -> Outputs:
+    """What `kernel` (a folder) answers on this machine to observations [N, O] and [M, O], compiled with `flags`."""
+    compiler = host_compiler()
+    if compiler is None:
+        raise ProofFailed("no C compiler on this machine (cc, gcc or clang)")
+    folder = _folder(work, "host", obs_f32, obs_i16)
+    _build([compiler, *flags, *_sources(kernel, "host.c"), *libraries, "-o", "proof"], folder, "host")
+    said = _run([str(folder.resolve() / "proof")], folder, "host", timeout_s)
+    return _read(folder, "host", said, obs_f32, obs_i16)[0]
+
+
+def run_core(
+    core: Core,
+    kernel: Path,
+    work: Path,
+    flags: Sequence[str],
+    obs_f32: Floats,
+    obs_i16: Ints,
+    libraries: Sequence[str] = (),
+    timeout_s: float = TIMEOUT_S,
+) -> tuple[Outputs, Counts]:
+    """What `kernel` answers on `core`, and what that cost; linked with nothing but libc, libgcc and `libraries`."""
+    folder = _folder(work, core.name, obs_f32, obs_i16)
+    memory = [f"-Wl,--defsym=FLASH_BYTES={core.flash_bytes}", f"-Wl,--defsym=RAM_BYTES={core.ram_bytes}"]
+    link = ["-nostdlib", "-T", str(SOURCES / "cortex_m.ld"), *memory, *libraries, "-lc", "-lgcc"]
+    sources = _sources(kernel, "startup.c")
+    _build(["arm-none-eabi-gcc", *core.flags, *flags, *sources, *link, "-o", "proof.elf"], folder, core.name)
+    said = _run(
+        ["qemu-system-arm", "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
+        + ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native", "-kernel", "proof.elf"],
+        folder,
+        core.name,
+        timeout_s,
+    )
+    outputs, fields, ticks = _read(folder, core.name, said, obs_f32, obs_i16)
+    return outputs, _counts(core, fields, ticks)
+
+
+def size(core: Core, kernel: Path, work: Path, flags: Sequence[str] = RELEASE, libraries: Sequence[str] = ()) -> Sizes:
+    """What the object file of `kernel` takes up on `core`, and the library code that it needs beside it."""
+    folder = Path(tempfile.mkdtemp(prefix=f"{core.name}-size-", dir=work))
+    compiler = ["arm-none-eabi-gcc", *core.flags]
+    _build([*compiler, *flags, "-c", str(kernel.resolve() / "qrl_policy.c"), "-o", "qrl_policy.o"], folder, core.name)
+    entry = ["-nostdlib", "-Wl,--entry=qrl_policy_step"]
+    _build([*compiler, *entry, "qrl_policy.o", *libraries, "-lc", "-lgcc", "-o", "linked.elf"], folder, core.name)
+    (text, data, bss), linked = (_sections(folder / name, core.name) for name in ("qrl_policy.o", "linked.elf"))
+    return Sizes(text, data, bss, max(0, linked[0] - text))
+
+
+def _sections(path: Path, where: str) -> list[int]:
+    """Bytes of text, data and bss."""
+    table = _build(["arm-none-eabi-size", path.name], path.parent, where)
+    return [int(number) for number in table.splitlines()[1].split()[:3]]
+
+
+def _folder(work: Path, name: str, obs_f32: Floats, obs_i16: Ints) -> Path:
+    """A fresh folder with the observations in it."""
+    folder = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=work))
+    (folder / "f32.bin").write_bytes(np.ascontiguousarray(obs_f32, "<f4").tobytes())
+    (folder / "i16.bin").write_bytes(np.ascontiguousarray(obs_i16, "<i2").tobytes())
+    return folder
+
+
+def _sources(kernel: Path, platform: str) -> list[str]:
+    folder = kernel.resolve()
+    return ["-I", str(folder), str(folder / "qrl_policy.c"), str(SOURCES / "harness.c"), str(SOURCES / platform)]
+
+
+def _build(command: list[str], folder: Path, where: str) -> str:
+    """The command's stdout; its first line about an error, raised, if it fails."""
+    done = subprocess.run(
+        command, cwd=folder, env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise ProofFailed(
+            f"{where}: {Path(command[0]).name}: {_first(done.stderr, 'error|undefined|overflowed|will not fit')}"
+        )
+    return done.stdout
+
+
+def _first(text: str, pattern: str) -> str:
+    """The first line with `pattern` in it, else the last line."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["it said nothing"]
+    return next((line for line in lines if re.search(pattern, line)), lines[-1])[:300]
+
+
+def _run(command: list[str], folder: Path, where: str, timeout_s: float) -> str:
+    """What the harness said; raises where it crashed or never ended."""
+    try:
+        done = subprocess.run(
+            command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise ProofFailed(f"{where}: no end after {timeout_s:g} s") from None
+    said = done.stderr.decode(errors="replace")
+    if done.returncode:
+        how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit {done.returncode}"
+        raise ProofFailed(f"{where}: the run broke off ({how}): {_first(said, 'qrl-proof-error|ERROR|Lockup')}")
+    return said
+
+
+def _fields(said: str, where: str) -> dict[str, int]:
+    """What stands in the one result line."""
+    lines = [line for line in said.splitlines() if line.startswith("qrl-proof:")]
+    if len(lines) != 1:
+        raise ProofFailed(f"{where}: {len(lines)} result lines where there must be one")
+    return {name: int(value) for name, value in re.findall(r"(\w+)=(-?\d+)", lines[0])}
+
+
+def _read(
+    folder: Path, where: str, said: str, obs_f32: Floats, obs_i16: Ints
+) -> tuple[Outputs, dict[str, int], tuple[Ints, Ints]]:
+    """Outputs, the fields of the result line, and (ticks, spins) int32 [N, 2], [M, 2] of a run that ended well."""
+    fields = _fields(said, where)
+    expected = {"obs": obs_f32.shape[1], "vectors_f32": len(obs_f32), "vectors_i16": len(obs_i16)}
+    if wrong := [f"{name} is {fields.get(name)}, not {n}" for name, n in expected.items() if fields.get(name) != n]:
+        raise ProofFailed(f"{where}: {', '.join(wrong)}")
+    layouts = [
+        np.dtype([("status", "<i4"), ("act", t, fields["act"]), ("guard", t, 2), ("elapsed", "<i4", 2)], align=True)
+        for t in ("<f4", "<i2")
+    ]
+    data, split = (folder / "out.bin").read_bytes(), len(obs_f32) * layouts[0].itemsize
+    if len(data) != (whole := split + len(obs_i16) * layouts[1].itemsize):
+        raise ProofFailed(f"{where}: out.bin has {len(data)} bytes, not {whole}")
+    f32, i16 = np.frombuffer(data[:split], layouts[0]), np.frombuffer(data[split:], layouts[1])
+    for records, entry in ((f32, "qrl_policy_step"), (i16, "qrl_policy_step_i16")):
+        if np.any(np.ascontiguousarray(records["guard"]).view(np.uint8) != GUARD):
+            raise ProofFailed(f"{where}: {entry} writes beyond its outputs")
+    outputs = Outputs(f32["status"], f32["act"], i16["status"], i16["act"], fields["selftest"])
+    return outputs, fields, (f32["elapsed"], i16["elapsed"])
+
+
+def _counts(core: Core, fields: dict[str, int], elapsed: tuple[Ints, Ints]) -> Counts:
+    def field(name: str) -> float:
+        return float(_instructions(core, np.array([fields[f"{name}_ticks"], fields[f"{name}_spins"]])))
+
+    around = field("known_0") - known_instructions(0)  # what measuring itself takes
+    check_clock(core, {rounds: field(f"known_{rounds}") - around for rounds in KNOWN_ROUNDS})
+    f32, i16 = (_instructions(core, each) - around for each in elapsed)
+    stacks = [fields[f"stack_{name}"] for name in ("f32", "i16", "selftest")]
+    return Counts(f32, i16, field("selftest") - around, *stacks)
+
+
+def _instructions(core: Core, elapsed: Ints) -> Floats:
+    """(ticks, spins) [..., 2] -> instructions [...]: from edge to edge, less the rounds spun after the call."""
+    return elapsed[..., 0] * core.tick - elapsed[..., 1] * 4.0
+
+
+def known_instructions(rounds: int) -> int:
+    """Instructions of the harness's function `known`."""
+    return 2 * rounds + 3
+
+
+def check_clock(core: Core, measured: dict[int, float]) -> None:
+    """ProofFailed unless `known`, called with these rounds, was measured at its length, in instructions."""
+    for rounds, instructions in measured.items():
+        if abs(instructions - known_instructions(rounds)) > CLOCK_ERROR:
+            raise ProofFailed(
+                f"{core.name}: a loop of {known_instructions(rounds)} instructions was measured as {instructions:g}:"
+                f" SysTick does not tick every {core.tick:g} instructions here"
+            )

@@ -1,0 +1,36 @@
+/* How firmware calls the policy: test at boot, then every control period read, step, act. Runs on a desk too. */
+#include <stdio.h>
+
+#include "qrl_policy.h"
+
+static void read_sensors(float obs[QRL_POLICY_OBS_SIZE]) {
+    static const float example[QRL_POLICY_OBS_SIZE] = @example_obs@;
+    for (int i = 0; i < QRL_POLICY_OBS_SIZE; ++i) {
+        obs[i] = example[i]; /* yours: the state estimate, in the order, units and frames of qrl_policy.h */
+    }
+}
+
+static void drive(const float act[QRL_POLICY_ACT_SIZE]) {
+    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+        printf("%s%.4f", i ? " " : "@act_names@: ", (double)act[i]); /* yours: thrust to motor command */
+    }
+    printf("\n");
+}
+
+int main(void) {
+    const int failed = qrl_policy_selftest();
+    if (failed) {
+        printf("self-test %d failed: this build does not compute the policy that was proved\n", failed);
+        return 1;
+    }
+    float obs[QRL_POLICY_OBS_SIZE], act[QRL_POLICY_ACT_SIZE];
+    read_sensors(obs);
+    const int status = qrl_policy_step(obs, act);
+    if (status == 2) {
+        printf("not a number among the inputs: act holds the safe action; hand over to a fallback controller\n");
+    } else if (status == 1) {
+        printf("an input was beyond the range it was calibrated for\n");
+    }
+    drive(act);
+    return 0;
+}

@@ -1,0 +1,382 @@
+/*
+@banner@
+ * See qrl_policy.h for what goes in and out, and for the licence (none needed).
+ */
+
+#include "qrl_policy.h"
+
+/*
+ * An integer network: int8 weights with a scale for each output, int16 activations, int32 accumulators.
+ *
+ *     acc = bias + sum(weight * x)                    at most @acc_bound@ in size, whatever x is: proved at export
+ *     y   = saturate(floor(acc * multiplier / 2^(16 + shift)))          the half that rounds is part of the bias
+ *
+ * One arithmetic in three bodies, the same to the bit: Arm with the DSP extension (Cortex-M4, M7, M33 ...), Armv6-M
+ * (Cortex-M0, M0+), and C99 for all else.
+ */
+#if defined(__ARM_FEATURE_DSP) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
+#define BODY_DSP
+#elif (defined(__ARM_ARCH_6M__) || defined(__ARM_ARCH_8M_BASE__)) && defined(__GNUC__)
+#define BODY_ARMV6M
+#endif
+
+#if defined(__ARM_FEATURE_SAT) && defined(__GNUC__)
+#define SATURATE
+#endif
+
+/* Negative numbers are shifted arithmetically below, which C99 leaves to the compiler. */
+typedef char needs_arithmetic_right_shift[(-1 >> 1) == -1 ? 1 : -1];
+
+#ifdef BODY_ARMV6M
+/* These cores load a byte with an offset only unsigned. So u = w + 2^7, v = x + 2^15, modulo 2^32, where
+   sum(u v) = sum(w x) + 2^15 sum(w) + 2^7 sum(v): the second sum is known here, the third one is shared by all rows. */
+typedef uint8_t weight;
+typedef uint16_t activation;
+typedef uint32_t accumulator;
+#define Q(w) ((w) + 128)
+#define BIAS(bias, sum_of_weights) ((int32_t)((uint32_t)(bias)-32768u * (uint32_t)(sum_of_weights)))
+#define OFFSET 32768
+#else
+typedef int8_t weight;
+typedef int16_t activation;
+typedef int32_t accumulator;
+#define Q(w) (w)
+#define BIAS(bias, sum_of_weights) (bias)
+#define OFFSET 0
+#endif
+
+#ifdef BODY_DSP /* halfwords by twos */
+typedef uint32_t factors;
+#define M2(m0, m1) (m0##u | m1##u << 16)
+#define FOUR 2
+#else
+typedef uint16_t factors;
+#define M2(m0, m1) m0, m1
+#define FOUR 4
+#endif
+
+/* The weights of one output for four inputs. SXTB16 takes bytes 0 and 2, so the middle ones change places. */
+#define W4(w0, w1, w2, w3) Q(w0), Q(w2), Q(w1), Q(w3)
+
+#define TANH @tanh@ /* else ReLU */
+
+union activations {
+    activation one[@widest@];
+    int32_t two[@widest@ / 2]; /* by pairs, and so aligned */
+};
+
+struct layer {
+    const weight *weights; /* tiles of 4 outputs x 4 inputs, along the inputs first */
+    const int32_t *biases;
+    const factors *of_rows; /* below 2^15 */
+    uint16_t inputs;             /* inputs and outputs are multiples of 4, filled up with zeros */
+    uint16_t outputs;
+    uint8_t hidden;              /* else the last one, which has no activation */
+    uint8_t shift;
+};
+
+struct input {
+    uint16_t scale;
+    int16_t exponent; /* 1 / lsb = scale * 2^(142 - exponent) */
+    int16_t limit;    /* saturates at +-limit steps */
+};
+
+struct golden {
+    float obs[QRL_POLICY_OBS_SIZE];
+    int16_t obs_i16[QRL_POLICY_OBS_SIZE];
+    int16_t act[QRL_POLICY_ACT_SIZE];
+    int8_t status, status_i16;
+};
+
+@tables@
+
+/* Four accumulators and what is added to them: the weights from `w` on times the activations from `x` to `last`. */
+struct four {
+    accumulator a0, a1, a2, a3;
+};
+
+#if defined(BODY_DSP)
+
+/* A word holds four weights of one output: SXTB16 spreads the even bytes, then, after a turn, the odd ones. */
+#define ROW(word, a)                          \
+    "sxtb16 %[t], %[" word "]\n\t"            \
+    "smlad  %[" a "], %[t], %[x0], %[" a "]\n\t" \
+    "sxtb16 %[t], %[" word "], ror #8\n\t"    \
+    "smlad  %[" a "], %[t], %[x1], %[" a "]\n\t"
+
+static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
+    accumulator a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+    int32_t w0, w1, x0, x1, t;
+    __asm__ volatile(
+        "1:\n\t"
+        "ldrd   %[x0], %[x1], [%[x]], #8\n\t"
+        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" ROW("w0", "a0") ROW("w1", "a1")
+        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" ROW("w0", "a2") ROW("w1", "a3")
+        "cmp    %[x], %[last]\n\t"
+        "bne    1b"
+        : [a0] "+r"(a0), [a1] "+r"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+r"(w), [x] "+r"(x), [w0] "=&r"(w0),
+          [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1), [t] "=&r"(t)
+        : [last] "r"(last)
+        : "cc", "memory");
+    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
+    return w;
+}
+
+#elif defined(BODY_ARMV6M)
+
+#define MAC(offset, a)                     \
+    "ldrb %[t], [%[w], #" offset "]\n\t"   \
+    "muls %[t], %[in], %[t]\n\t"           \
+    "add  %[" a "], %[t]\n\t"
+#define COLUMN(in, o0, o1, o2, o3) "ldrh %[in], [%[x], #" in "]\n\t" MAC(o0, "a0") MAC(o1, "a1") MAC(o2, "a2") MAC(o3, "a3")
+
+static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
+    accumulator a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+    uint32_t in, t;
+    __asm__ volatile(
+        ".syntax unified\n"
+        "1:\n\t" COLUMN("0", "0", "4", "8", "12") COLUMN("2", "2", "6", "10", "14") COLUMN("4", "1", "5", "9", "13")
+            COLUMN("6", "3", "7", "11", "15")
+        "adds %[w], %[w], #16\n\t"
+        "adds %[x], %[x], #8\n\t"
+        "cmp  %[x], %[last]\n\t"
+        "bne  1b"
+        : [a0] "+h"(a0), [a1] "+h"(a1), [a2] "+h"(a2), [a3] "+h"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
+          [t] "=&l"(t)
+        : [last] "r"(last)
+        : "cc", "memory");
+    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
+    return w;
+}
+
+#else
+
+static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
+    int32_t a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+    for (; x != last; x += 4, w += 16) {
+        int32_t in = x[0];
+        a0 += w[0] * in, a1 += w[4] * in, a2 += w[8] * in, a3 += w[12] * in;
+        in = x[1];
+        a0 += w[2] * in, a1 += w[6] * in, a2 += w[10] * in, a3 += w[14] * in;
+        in = x[2];
+        a0 += w[1] * in, a1 += w[5] * in, a2 += w[9] * in, a3 += w[13] * in;
+        in = x[3];
+        a0 += w[3] * in, a1 += w[7] * in, a2 += w[11] * in, a3 += w[15] * in;
+    }
+    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
+    return w;
+}
+
+#endif
+
+/* Saturated to 16 bits. */
+static inline int32_t saturated(int32_t z) {
+#ifdef SATURATE
+    __asm__("ssat %0, #16, %1" : "=r"(z) : "r"(z));
+    return z;
+#else
+    return z > 32767 ? 32767 : z < -32768 ? -32768 : z;
+#endif
+}
+
+#if TANH
+
+/* tanh of z * 6 / 2^15, by a table at every 2^8 and straight lines between. */
+static inline int32_t activated(int32_t z) {
+    z = saturated(z);
+    const int16_t *const at = tanh_table + 128 + (z >> 8);
+    const int32_t low = at[0];
+    return low + (((at[1] - low) * (z & 255) + 128) >> 8);
+}
+
+#else
+
+/* ReLU: within [0, 32767]. */
+static inline int32_t activated(int32_t z) {
+#ifdef SATURATE
+    __asm__("usat %0, #15, %1" : "=r"(z) : "r"(z));
+    return z;
+#else /* without a branch */
+    z &= ~(z >> 31);
+    z -= 32767;
+    z &= z >> 31;
+    return z + 32767;
+#endif
+}
+
+#endif
+
+/* The outputs of four accumulators; `hidden` layers have an activation. */
+#ifdef BODY_DSP
+
+/* Two factors, and two outputs, in a word. */
+static inline int32_t two_outputs(int32_t acc0, int32_t acc1, uint32_t factor, int shift, int hidden) {
+    int32_t z0, z1, word;
+    __asm__("smulwb %0, %1, %2" : "=r"(z0) : "r"(acc0), "r"(factor));
+    __asm__("smulwt %0, %1, %2" : "=r"(z1) : "r"(acc1), "r"(factor));
+    z0 = hidden ? activated(z0 >> shift) : saturated(z0 >> shift);
+    z1 = hidden ? activated(z1 >> shift) : saturated(z1 >> shift);
+    __asm__("pkhbt %0, %1, %2, lsl #16" : "=r"(word) : "r"(z0), "r"(z1));
+    return word;
+}
+
+static inline void four_outputs(union activations *y, int at, const struct four *s, const factors *factor, int shift,
+                                int hidden) {
+    y->two[at / 2] = two_outputs(s->a0, s->a1, factor[0], shift, hidden);
+    y->two[at / 2 + 1] = two_outputs(s->a2, s->a3, factor[1], shift, hidden);
+}
+
+#else
+
+static inline activation output(accumulator acc, uint32_t factor, int shift, int hidden) {
+#ifdef BODY_ARMV6M /* by halves, for there is no 64-bit product */
+    const int32_t high = (int32_t)acc >> 16;
+    const int32_t z = (high * (int32_t)factor + (int32_t)((uint16_t)acc * factor >> 16)) >> shift;
+#else
+    const int32_t z = (int32_t)(((int64_t)acc * (int32_t)(factor << 16)) >> 32) >> shift;
+#endif
+    return (activation)((hidden ? activated(z) : saturated(z)) + OFFSET);
+}
+
+static inline void four_outputs(union activations *y, int at, const struct four *s, const factors *factor, int shift,
+                                int hidden) {
+    y->one[at] = output(s->a0, factor[0], shift, hidden);
+    y->one[at + 1] = output(s->a1, factor[1], shift, hidden);
+    y->one[at + 2] = output(s->a2, factor[2], shift, hidden);
+    y->one[at + 3] = output(s->a3, factor[3], shift, hidden);
+}
+
+#endif
+
+/* One layer, four outputs at a time. */
+static void dense(const struct layer *l, const union activations *in, union activations *y) {
+    const activation *const x = in->one, *const last = x + l->inputs;
+    const weight *w = l->weights;
+    const int32_t *bias = l->biases;
+    const factors *factor = l->of_rows;
+    const int shift = l->shift;
+    accumulator shared = 0;
+#ifdef BODY_ARMV6M
+    for (const activation *v = x; v != last; v += 4) {
+        shared += (accumulator)v[0] + v[1] + v[2] + v[3];
+    }
+    shared *= 128u;
+#endif
+    for (int at = 0; at < l->outputs; at += 4, bias += 4, factor += FOUR) {
+        struct four s = {(accumulator)bias[0] - shared, (accumulator)bias[1] - shared, (accumulator)bias[2] - shared,
+                         (accumulator)bias[3] - shared};
+        w = accumulate(&s, w, x, last);
+        if (l->hidden) {
+            four_outputs(y, at, &s, factor, shift, 1);
+        } else {
+            four_outputs(y, at, &s, factor, shift, 0);
+        }
+    }
+}
+
+/* From quantised inputs in `a`, filled up with zeros, to the outputs of the last layer, which it returns. */
+static const activation *network(union activations *a, union activations *b) {
+    for (const struct layer *l = layers; l != layers + LAYERS; ++l) {
+        dense(l, a, b);
+        union activations *const swapped = a;
+        a = b;
+        b = swapped;
+    }
+    return a->one;
+}
+
+static int16_t action(activation y, int i) {
+    const int32_t z = (int32_t)y - OFFSET;
+    return (int16_t)(z < act_least[i] ? act_least[i] : z > act_most[i] ? act_most[i] : z);
+}
+
+/* Put one input in its place, saturated; 1 if that changed it. */
+static int put(union activations *x, int i, int32_t q) {
+    const int32_t limit = inputs[i].limit;
+    const int32_t within = q > limit ? limit : q < -limit ? -limit : q;
+    x->one[i] = (activation)(within + OFFSET);
+    return within != q;
+}
+
+static void fill_up(union activations *x) {
+    for (int i = QRL_POLICY_OBS_SIZE; i < PADDED_OBS_SIZE; ++i) {
+        x->one[i] = (activation)OFFSET;
+    }
+}
+
+/* Round x / lsb to an integer, x given by the bits of a finite float; beyond 32767 it may be anything beyond 32767.
+   With integers alone: no compiler flag can change it, and no core needs a floating-point library for it. */
+static int32_t quantised(uint32_t bits, const struct input *in) {
+    const int32_t right = in->exponent - (int32_t)(bits >> 23 & 255u);
+    if (right > 32) {
+        return 0; /* below half an lsb */
+    }
+    const uint32_t product = ((bits & 0x7fffffu) | 0x800000u) / 256u * in->scale; /* at least 2^30 */
+    const int32_t size = (int32_t)(((product >> (right < 15 ? 14 : right - 1)) + 1u) / 2u);
+    return bits >> 31 ? -size : size;
+}
+
+int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]) {
+    union activations a, b;
+    int status = 0;
+    for (int i = 0; i < QRL_POLICY_OBS_SIZE; ++i) {
+        const union {
+            float real;
+            uint32_t bits;
+        } in = {obs[i]};
+        if ((in.bits & 0x7f800000u) == 0x7f800000u) { /* by its bits: -ffast-math believes that no float is a NaN */
+            for (int j = 0; j < QRL_POLICY_ACT_SIZE; ++j) {
+                act[j] = act_safe[j];
+            }
+            return 2;
+        }
+        status |= put(&a, i, quantised(in.bits, &inputs[i]));
+    }
+    fill_up(&a);
+    const activation *const y = network(&a, &b);
+    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+        act[i] = (float)action(y[i], i) * act_lsb[i];
+    }
+    return status;
+}
+
+int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]) {
+    union activations a, b;
+    int status = 0;
+    for (int i = 0; i < QRL_POLICY_OBS_SIZE; ++i) {
+        status |= put(&a, i, obs[i]);
+    }
+    fill_up(&a);
+    const activation *const y = network(&a, &b);
+    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+        act[i] = action(y[i], i);
+    }
+    return status;
+}
+
+int qrl_policy_selftest(void) {
+    for (int k = 0; k < GOLDENS; ++k) {
+        float act[QRL_POLICY_ACT_SIZE];
+        int16_t act_i16[QRL_POLICY_ACT_SIZE];
+        int wrong = qrl_policy_step(goldens[k].obs, act) != goldens[k].status;
+        wrong |= qrl_policy_step_i16(goldens[k].obs_i16, act_i16) != goldens[k].status_i16;
+        for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+            wrong |= act_i16[i] != goldens[k].act[i];
+            wrong |= !(act[i] == (float)goldens[k].act[i] * act_lsb[i]);
+        }
+        if (wrong) {
+            return k + 1;
+        }
+    }
+    const union {
+        uint32_t bits;
+        float real;
+    } nan = {0x7fc00000u};
+    float obs[QRL_POLICY_OBS_SIZE] = {0}, act[QRL_POLICY_ACT_SIZE];
+    obs[QRL_POLICY_OBS_SIZE - 1] = nan.real;
+    int wrong = qrl_policy_step(obs, act) != 2;
+    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+        wrong |= !(act[i] == act_safe[i]);
+    }
+    return wrong ? GOLDENS + 1 : 0;
+}

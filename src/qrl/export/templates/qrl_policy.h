@@ -1,0 +1,49 @@
+/*
+@banner@
+ *
+ * Call once every @period_s@ s, the period the policy was trained with.
+ * World and body frames: x forward, y left, z up. SI units.
+ *
+@ports@
+ *
+ * lsb: what one step of the integer entry is worth. range: inputs beyond it are clipped, and the status is 1.
+ * Needs C99, no library, no heap; keeps no state, so it may be called from anywhere. Stack and cycles: report.md.
+ * The code in this folder may be used without restriction, in whatever product and under whatever licence.
+ */
+#ifndef QRL_POLICY_H
+#define QRL_POLICY_H
+
+#include <stdint.h>
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define QRL_POLICY_OBS_SIZE @obs_size@
+#define QRL_POLICY_ACT_SIZE @act_size@
+#define QRL_POLICY_PERIOD_US @period_us@
+
+/* Places in obs and act. */
+enum {
+@places@
+};
+
+/* For the integer entry, as initialisers: float obs_lsb[] = QRL_POLICY_OBS_LSB; */
+#define QRL_POLICY_OBS_LSB @obs_lsb@
+#define QRL_POLICY_ACT_LSB @act_lsb@
+
+/* SI units. Returns 0; or 1: an input was clipped to its range; or 2: an input was not finite, and act holds the
+   safe action. */
+int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]);
+
+/* The same in steps of lsb, for chips without floating point. Returns 0 or 1. */
+int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]);
+
+/* Run the embedded golden vectors, at boot say. Returns 0 when all of them are reproduced to the bit, else which failed. */
+int qrl_policy_selftest(void);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif
