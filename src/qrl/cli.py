@@ -52,6 +52,13 @@ def positive(text: str) -> float:
     return value
 
 
+def vectors(text: str) -> int:
+    value = whole_number(text)
+    if value < 500:  # fewer would leave kinds of them out
+        raise ValueError
+    return value
+
+
 def _parse(argv: list[str] | None) -> argparse.Namespace:
     parser = _Parser(prog="qrl", description="From a vehicle and a task to a policy that flies.", allow_abbrev=False)
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -76,7 +83,11 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     export.add_argument("run", type=Path, help="run folder", metavar="RUN")
     export.add_argument("--starts", type=count, default=1000, help="how many starts to fly it from (1000)", metavar="N")
     export.add_argument(
-        "--vectors", type=count, default=2000, help="observations to hold the C against (2000)", metavar="N"
+        "--vectors",
+        type=vectors,
+        default=2000,
+        help="observations to hold the C against (2000; 500 or more)",
+        metavar="N",
     )
 
     sweep = commands.add_parser(

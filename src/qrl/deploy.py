@@ -98,7 +98,7 @@ class Run:
         observed, acted = self._ports()
         policy = Policy(
             origin=self._origin(),
-            control_period_s=self._task.control_period_s if self._task else float(getattr(self.env, "dt", np.nan)),
+            control_period_s=self._task.control_period_s if self._task else self._foreign_period_s(),
             observed=observed,
             acted=acted,
             observation_offset=shipped.statistics.mean if config.normalise_observations else np.zeros(size),
@@ -130,6 +130,12 @@ class Run:
         largest = seen.pop("largest")
         drawn = [_thinned(part, round(SAMPLES * SHARES[name])) for name, part in seen.items()]
         return np.concatenate([*drawn, largest[np.abs(largest).argmax(axis=0)]])
+
+    def _foreign_period_s(self) -> float:
+        period = getattr(self.env, "dt", None)
+        if period is None:
+            raise BadInput(f"{self.folder}: the environment '{self.config.task.name}' does not say its control period")
+        return float(period)
 
     def tail_steps(self) -> int:
         """The last steps of a flight, in which it is judged."""
@@ -171,7 +177,10 @@ def flown(policy: Policy, flights: Flights, tail_steps: int) -> Flown:
     low, high = policy.limits
     actions = policy.in_units(np.asarray(flights.actions[:, -tail_steps:])) / (high - low)
     return Flown(
-        summary=summarise(flights), jitter=float(np.abs(np.diff(actions, axis=1)).mean()), starts=len(flights.returns)
+        summary=summarise(flights),
+        success=np.asarray(flights.measures["success"]) > 0.5 if "success" in flights.measures else None,
+        jitter=float(np.abs(np.diff(actions, axis=1)).mean()),
+        starts=len(flights.returns),
     )
 
 
@@ -203,9 +212,15 @@ def export(run: Run, starts: int, vectors: int, say: Callable[[str], None]) -> E
         proving = pool.submit(prove, policy, kernel, folder, vectors)
         measured = _measured(run, policy, kernel, starts, proving.result)
         _write(folder, {"report.md": report(policy, kernel, measured)})
+        before = Path(scratch) / "before"
         if target.exists():
-            target.replace(Path(scratch) / "before")
-        folder.replace(target)
+            target.replace(before)
+        try:
+            folder.replace(target)
+        except OSError:
+            if before.exists():
+                before.replace(target)
+            raise
     return Exported(policy, measured, target)
 
 

@@ -19,6 +19,7 @@ from qrl.export.kernel import Dense, Ints, Kernel
 from qrl.policy import Policy
 
 FORMAT = 1
+FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"
 EMBEDDED = 2  # golden vectors inside the C, for the self-test
 
 
@@ -83,7 +84,6 @@ def _filled(text: str, words: dict[str, str]) -> str:
 
 def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
     """DESIGN.md's manifest.json."""
-    reach = kernel.limit * kernel.lsb
     act_lsb = kernel.act_lsb.astype(float)
     return {
         "format": FORMAT,
@@ -96,7 +96,14 @@ def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
         "network": [len(policy.observed), *(len(layer.bias) for layer in kernel.layers)],
         "activation": kernel.activation,
         "obs": [
-            {"name": o.name, "unit": o.unit, "frame": o.frame, "range": [-reach[i], reach[i]], "lsb": kernel.lsb[i]}
+            {
+                "name": o.name,
+                "unit": o.unit,
+                "frame": o.frame,
+                "range": [float(bound[i] * kernel.lsb[i]) for bound in (kernel.least, kernel.most)],
+                "steps": [int(kernel.least[i]), int(kernel.most[i])],
+                "lsb": float(kernel.lsb[i]),
+            }
             for i, o in enumerate(policy.observed)
         ],
         "act": [
@@ -123,17 +130,21 @@ def _words(policy: Policy, kernel: Kernel, golden: Golden) -> dict[str, str]:
     return {
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(origin.task),
-        "ports": "\n".join(f" * {_comment_safe(line)}" for line in _port_lines(policy, kernel)),
+        "ports": "\n".join(f" * {_comment_safe(line)}".rstrip() for line in _port_lines(policy, kernel)),
+        "frames": FRAMES if any(port.spin is not None for port in policy.acted) else " * SI units.\n *",
+        "description_json": json.dumps(f"A trained policy for {origin.task} as an integer kernel"),
         "period_s": f"{policy.control_period_s:g}",
         "period_us": f"{round(policy.control_period_s * 1e6)}",
         "obs_size": str(len(policy.observed)),
         "act_size": str(len(policy.acted)),
-        "places": "\n".join(
-            f"    QRL_POLICY_{kind}_{port.name.upper()} = {i},"
+        "places": ",\n".join(
+            f"    QRL_POLICY_{kind}_{port.name.upper()} = {i}"
             for kind, ports in (("OBS", policy.observed), ("ACT", policy.acted))
             for i, port in enumerate(ports)
         ),
         "obs_lsb": _floats(kernel.lsb.astype(np.float32)),
+        "obs_least": ", ".join(map(str, kernel.least)),
+        "obs_most": ", ".join(map(str, kernel.most)),
         "act_lsb": _floats(kernel.act_lsb),
         "act_names": " ".join(port.name for port in policy.acted),
         "example_obs": _floats(golden.obs[0]),
@@ -149,15 +160,16 @@ def _network(policy: Policy) -> str:
 
 
 def _comment_safe(text: str) -> str:
-    """Text that can neither end a C comment nor continue a line."""
-    return text.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace("\n", " ")
+    """Text on one line that neither begins nor ends a C comment, nor continues its line."""
+    text = "".join(c if c.isprintable() else " " for c in text.replace("\\", "|").replace("??/", "?? /"))
+    return text.replace("*/", "* /").replace("/*", "/ *")
 
 
 def _port_lines(policy: Policy, kernel: Kernel) -> Iterable[str]:
-    reach, act_lsb = kernel.limit * kernel.lsb, kernel.act_lsb.astype(float)
+    lows, highs, act_lsb = kernel.least * kernel.lsb, kernel.most * kernel.lsb, kernel.act_lsb.astype(float)
     yield "obs  name        unit    range                  lsb        meaning"
     for i, o in enumerate(policy.observed):
-        yield f"{i:>3}  {o.name:<11} {o.unit:<7} {-reach[i]:>9.4g} .. {reach[i]:<9.4g} {kernel.lsb[i]:<10.4g} {o.frame}"
+        yield f"{i:>3}  {o.name:<11} {o.unit:<7} {lows[i]:>9.4g} .. {highs[i]:<9.4g} {kernel.lsb[i]:<10.4g} {o.frame}"
     yield ""
     yield "act  name        unit    range                  lsb        meaning"
     for i, a in enumerate(policy.acted):
@@ -181,7 +193,8 @@ def _padded(n: int) -> int:
 
 def _tables(kernel: Kernel, golden: Golden) -> str:
     sizes = [_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers)]
-    inputs = (f"{{{s}u, {e}, {m}}}" for s, e, m in zip(kernel.scale, kernel.exponent, kernel.limit, strict=True))
+    columns = kernel.scale, kernel.exponent, kernel.least, kernel.most
+    inputs = (f"{{{s}u, {e}, {least}, {most}}}" for s, e, least, most in zip(*columns, strict=True))
     parts = [
         f"#define LAYERS {len(kernel.layers)}\n#define PADDED_OBS_SIZE {sizes[0]}\n#define GOLDENS {EMBEDDED}",
         _array("struct input inputs[QRL_POLICY_OBS_SIZE]", inputs, 6),
@@ -231,8 +244,9 @@ def _layer_tables(index: int, layer: Dense) -> str:
 
 def _golden_rows(golden: Golden) -> Iterable[str]:
     for i in range(EMBEDDED):
-        obs_i16, act = (f"{{{', '.join(map(str, x[i]))}}}" for x in (golden.obs_i16, golden.act))
-        yield f"{{{_floats(golden.obs[i])},\n     {obs_i16},\n     {act}, {golden.status[i]}, {golden.status_i16[i]}}}"
+        obs_i16, act = (", ".join(map(str, x[i])) for x in (golden.obs_i16, golden.act))
+        columns = f"{{{_floats(golden.obs[i])}}}", f"{{{obs_i16}}}", f"{{{act}}}"
+        yield f"{{{', '.join(columns)}, {golden.status[i]}, {golden.status_i16[i]}}}"
 
 
 def _array(declaration: str, values: Iterable[Any], columns: int) -> str:
@@ -251,7 +265,7 @@ def _float(value: np.floating) -> str:
 
 
 def _floats(values: NDArray[np.float32]) -> str:
-    return f"{{{', '.join(map(_float, values))}}}"
+    return ", ".join(map(_float, values))
 
 
 def _golden_csv(policy: Policy, golden: Golden) -> str:

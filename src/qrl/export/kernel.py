@@ -27,7 +27,8 @@ class Kernel:
 
     scale: Ints  # [F] in [2¹⁵, 2¹⁶)
     exponent: Ints  # [F]
-    limit: Ints  # [F] x saturates at ±limit
+    least: Ints  # [F] x saturates at least and most
+    most: Ints  # [F]
     layers: tuple[Dense, ...]
     activation: str
     act_lsb: NDArray[np.float32]  # [A]
@@ -47,7 +48,8 @@ class PossibleOverflow(ArithmeticError):
 
 def accumulator_bound(kernel: Kernel) -> int:
     """The largest size that any accumulator can reach, whatever is observed; PossibleOverflow from 2³¹ on."""
-    most, size = 0, kernel.limit
+    _check_fields(kernel)
+    most, size = 0, np.maximum(-kernel.least, kernel.most)
     for i, layer in enumerate(kernel.layers):
         bounds = np.abs(layer.weight) @ size + np.abs(layer.bias)
         row = int(np.argmax(bounds))
@@ -55,6 +57,27 @@ def accumulator_bound(kernel: Kernel) -> int:
             raise PossibleOverflow(f"layer {i}, output {row}: the sum of products can reach {bounds[row]:,}, past 2^31")
         most, size = max(most, int(bounds[row])), np.full(len(layer.bias), INT16 + 1)
     return most
+
+
+def _check_fields(kernel: Kernel) -> None:
+    """PossibleOverflow where a number does not fit the type that holds it in C."""
+    ranges = [
+        ("an input's scale", kernel.scale, 2**15, 2**16 - 1),
+        ("an input's exponent", kernel.exponent, -(2**15), INT16),
+        ("an input's range", kernel.least, -INT16, 0),
+        ("an input's range", kernel.most, 0, INT16),
+        ("an action's range", np.concatenate([kernel.act_least, kernel.act_most]), -INT16, INT16),
+    ]
+    for layer in kernel.layers:
+        ranges += [
+            ("a weight", layer.weight, -127, 127),
+            ("a bias", layer.bias, -(2**31) + 1, 2**31 - 1),
+            ("a multiplier", layer.multiplier, 0, INT16),
+            ("a shift", np.array(layer.shift), 0, 15),
+        ]
+    for what, values, low, high in ranges:
+        if values.min() < low or values.max() > high:
+            raise PossibleOverflow(f"{what} is outside [{low}, {high}]")
 
 
 def tanh_table() -> Ints:
@@ -103,14 +126,14 @@ def _squashed(z: Ints) -> Ints:
 def step_i16(kernel: Kernel, observation: NDArray[np.int16]) -> tuple[Ints, NDArray[np.int16]]:
     """Status [n] and action [n, A] of observations [n, F], both in steps: qrl_policy_step_i16."""
     wanted = observation.astype(np.int64)
-    x = np.clip(wanted, -kernel.limit, kernel.limit)
+    x = np.clip(wanted, kernel.least, kernel.most)
     return np.any(x != wanted, axis=-1).astype(np.int64), network(kernel, x).astype(np.int16)
 
 
 def step(kernel: Kernel, observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
     """Status [n] and action [n, A] of observations [n, F], both in SI units: qrl_policy_step."""
     wanted, finite = quantised(kernel, observation)
-    x = np.clip(wanted, -kernel.limit, kernel.limit)
+    x = np.clip(wanted, kernel.least, kernel.most)
     action = network(kernel, x).astype(np.float32) * kernel.act_lsb
     status = np.where(finite, np.any(x != wanted, axis=-1), 2)
     return status, np.where(finite[:, None], action, kernel.act_safe)

@@ -22,6 +22,7 @@ INT8 = 127
 RANGE_MARGIN = 1.05  # of an observation beyond what was met
 ACTIVATION_MARGIN = 1.2
 LEAST_LEVELS = 511  # steps that an input or activation keeps in its range, however little its weights say
+LEAST_INPUT = 1e-3  # an input that was always zero may move one day
 LEAST_RANGE = 0.05  # of an activation, against its layer's largest: one that slept in every flight may wake
 RIDGES = (0.01, 0.03, 0.3)  # how strongly the fitted weights are held to the float ones, in the order of trial
 GOOD_ENOUGH = 0.03  # worst error of the action on the calibration, in full scales, at which no other ridge is tried
@@ -55,19 +56,24 @@ def quantise(policy: Policy) -> Kernel:
 
 def _quantised(policy: Policy, ridge: float) -> Kernel:
     layers = si_layers(policy)
-    x_float = policy.calibration.astype(np.float64)
-    envelope = np.abs(x_float).max(axis=0) * RANGE_MARGIN
+    clip = policy.observation_clip / policy.observation_gain
+    floor, ceiling = policy.observation_offset - clip, policy.observation_offset + clip
+    x_float = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
+    envelope = np.abs(x_float).max(axis=0)
+    envelope = RANGE_MARGIN * np.maximum(envelope, LEAST_INPUT * max(envelope.max(), LEAST_INPUT))
     scale, exponent = _as_scale(_steps(envelope, layers[0][0], LEAST_LEVELS))
     step = 2.0 ** (exponent - 142) / scale
-    limit = np.minimum(np.floor(envelope / step), INT16).astype(np.int64)
+    reach = np.minimum(np.floor(envelope / step), INT16)
+    least = np.clip(np.round(floor / step), -reach, 0).astype(np.int64)
+    most = np.clip(np.round(ceiling / step), 0, reach).astype(np.int64)
     low, high = policy.limits
     act_lsb = (np.maximum(np.abs(low), np.abs(high)) / INT16).astype(np.float32)
 
     thin = slice(None, None, max(1, len(x_float) // FIT_SAMPLES))
-    reach = _reaches(layers, policy.activation, x_float)
+    reaches = _reaches(layers, policy.activation, x_float)
     x_float = x_float[thin]
     felt = _sensitivities(policy, layers, x_float)
-    x = np.clip(np.round(x_float / step), -limit, limit).astype(np.int64)
+    x = np.clip(np.round(x_float / step), least, most).astype(np.int64)
     dense: list[Dense] = []
     for i, (weight, bias) in enumerate(layers):
         wanted = x_float @ weight + bias
@@ -75,7 +81,7 @@ def _quantised(policy: Policy, ridge: float) -> Kernel:
         if last:
             out = act_lsb.astype(np.float64)
         elif policy.activation == "relu":
-            out = _steps(reach[i], layers[i + 1][0], LEAST_LEVELS)
+            out = _steps(reaches[i], layers[i + 1][0], LEAST_LEVELS)
         else:
             out = np.full(len(bias), TANH_RANGE / (INT16 + 1))
         dense.append(_dense(weight * step[:, None], wanted, x, felt[i], out, ridge))
@@ -86,8 +92,8 @@ def _quantised(policy: Policy, ridge: float) -> Kernel:
         step = out if policy.activation == "relu" else np.full(len(bias), 1.0 / INT16)
 
     safe = np.array([port.safe for port in policy.acted], np.float32)
-    least, most = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
-    kernel = Kernel(scale, exponent, limit, tuple(dense), policy.activation, act_lsb, least, most, safe)
+    act_least, act_most = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
+    kernel = Kernel(scale, exponent, least, most, tuple(dense), policy.activation, act_lsb, act_least, act_most, safe)
     accumulator_bound(kernel)
     return kernel
 
@@ -117,9 +123,10 @@ def _reaches(layers: list[Layer], activation: str, x: Floats) -> list[Floats]:
     """How far the activations [outputs] of each hidden layer must reach."""
     reaches: list[Floats] = []
     for weight, bias in layers[:-1]:
-        x = ACTIVATIONS[activation](x @ weight + bias)
+        z = x @ weight + bias
+        x = ACTIVATIONS[activation](z)
         largest = np.abs(x).max(axis=0)
-        reaches.append(ACTIVATION_MARGIN * np.maximum(largest, LEAST_RANGE * max(largest.max(), 1e-6)))
+        reaches.append(ACTIVATION_MARGIN * np.maximum(largest, LEAST_RANGE * max(np.abs(z).max(), 1e-6)))
     return reaches
 
 
@@ -161,19 +168,25 @@ def _dense(weight: Floats, wanted: Floats, x: Ints, felt: Floats, out: Floats, r
 
     `weight` [inputs, outputs] is the float layer's for inputs in steps; `felt` [n, outputs] weighs the samples.
     """
-    rows = [_row(weight[:, o], wanted[:, o], x.astype(np.float64), felt[:, o], ridge) for o in range(len(out))]
+    # A row of tiny weights keeps a coarse unit, so that its multiplier and its bias keep their precision.
+    ratios = np.abs(weight).max(axis=0) / INT8 / out
+    floor = np.maximum(out * max(ratios.max() / 256.0, 2.0**-20), np.abs(wanted).max(axis=0) / 2.0**28)
+    x_real = x.astype(np.float64)
+    rows = [_row(weight[:, o], wanted[:, o], x_real, felt[:, o], ridge, floor[o]) for o in range(len(out))]
     integers, biases, units = (np.array(column) for column in zip(*rows, strict=True))
     ratio = units / out
     shift = int(np.clip(np.floor(np.log2(32767.0 / ratio.max())) - 16, 0, 15))
     multiplier = np.maximum(np.round(ratio * 2.0 ** (16 + shift)), 1.0)
     if multiplier.max() > 32767:
         raise Inexpressible("a layer magnifies more than its 16-bit outputs can hold")
-    bias = np.clip(np.round(biases + 2.0 ** (15 + shift) / multiplier), -(2.0**62), 2.0**62)
+    bias = np.round(biases + 2.0 ** (15 + shift) / multiplier)
     return Dense(integers.astype(np.int64), bias.astype(np.int64), multiplier.astype(np.int64), shift)
 
 
-def _row(weight: Floats, wanted: Floats, x: Floats, felt: Floats, ridge: float) -> tuple[Floats, float, float]:
-    """Integers [inputs] and bias with unit·(integers·x + bias) near `wanted` [n], and that unit.
+def _row(
+    weight: Floats, wanted: Floats, x: Floats, felt: Floats, ridge: float, floor: float
+) -> tuple[Floats, float, float]:
+    """Integers [inputs] and bias with unit·(integers·x + bias) near `wanted` [n], and that unit, at least `floor`.
 
     The bias takes up the mean of what is left, so all else is done about the mean.
     """
@@ -187,7 +200,7 @@ def _row(weight: Floats, wanted: Floats, x: Floats, felt: Floats, ridge: float) 
     second += np.diag(ridge * diagonal + 1e-5 * diagonal.mean() + 1e-12)
     middle = share @ wanted
     fitted = weight + np.linalg.solve(second, weighted.T @ (wanted - middle - centred @ weight))
-    finest = max(float(np.abs(fitted).max()) / INT8, 1e-12)
+    finest = max(float(np.abs(fitted).max()) / INT8, floor)
     integers = _rounded(fitted / (finest * UNITS[:, None]), second)
     error = integers * (finest * UNITS[:, None]) - fitted
     best = int(np.argmin(np.einsum("ui,ij,uj->u", error, second, error)))

@@ -14,11 +14,12 @@ def observations(policy: Policy, kernel: Kernel, n: int, seed: int = 0) -> NDArr
     at random within, at steps and half-steps, denormal, infinite, not a number, and random bits.
     """
     rng = np.random.default_rng(seed)
-    reach = kernel.limit * kernel.lsb
+    reach = np.maximum(-kernel.least, kernel.most) * kernel.lsb
+    low, high = kernel.least * kernel.lsb, kernel.most * kernel.lsb
     size = len(reach)
     flights = policy.calibration[rng.integers(len(policy.calibration), size=n // 2)]
     fixed = [
-        np.stack([np.zeros(size), reach, -reach, 2 * reach, -2 * reach]),
+        np.stack([np.zeros(size), high, low, 2 * reach, -2 * reach]),
         reach * np.concatenate([np.eye(size), -np.eye(size), 1 - 2 * np.eye(size)]),
         np.stack([np.full(size, sign * value) for value in EXTREME for sign in (1, -1)]),
         np.where(np.eye(size) > 0, np.nan, 0.0),
@@ -28,7 +29,7 @@ def observations(policy: Policy, kernel: Kernel, n: int, seed: int = 0) -> NDArr
     drawn = [
         rng.uniform(-reach, reach, (each, size)),
         rng.uniform(-3 * reach, 3 * reach, (each, size)),
-        rng.integers(-2 * kernel.limit, 2 * kernel.limit + 1, (each, size)) / 2 * kernel.lsb,
+        rng.integers(2 * kernel.least, 2 * kernel.most + 1, (each, size)) / 2 * kernel.lsb,
         rng.integers(0, 2**32, (n, size), dtype=np.uint32).view(np.float32),
     ]
     with np.errstate(over="ignore", invalid="ignore"):  # signalling NaNs among the bits
@@ -40,13 +41,13 @@ def observations_i16(policy: Policy, kernel: Kernel, n: int, seed: int = 0) -> N
     the ranges at random, within the ranges, and anything.
     """
     rng = np.random.default_rng(seed)
-    size = len(kernel.limit)
+    size = len(kernel.most)
     flights = policy.calibration[rng.integers(len(policy.calibration), size=n // 2)] / kernel.lsb
     fixed = np.stack([np.full(size, value) for value in (0, 1, -1, INT16, -INT16, -INT16 - 1)])
     each = n // 8
     drawn = [
-        kernel.limit * rng.choice([-1, 1], (each, size)),
-        rng.integers(-kernel.limit, kernel.limit + 1, (each, size)),
+        np.where(rng.random((each, size)) < 0.5, kernel.least, kernel.most),
+        rng.integers(kernel.least, kernel.most + 1, (each, size)),
         rng.integers(-INT16 - 1, INT16 + 1, (n, size)),
     ]
     return np.concatenate([np.clip(np.round(flights), -INT16, INT16), fixed, *drawn])[:n].astype(np.int16)

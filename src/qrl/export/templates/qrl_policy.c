@@ -14,7 +14,7 @@
  * One arithmetic in three bodies, the same to the bit: Arm with the DSP extension (Cortex-M4, M7, M33 ...), Armv6-M
  * (Cortex-M0, M0+), and C99 for all else.
  */
-#if defined(__ARM_FEATURE_DSP) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
+#if defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
 #define BODY_DSP
 #elif (defined(__ARM_ARCH_6M__) || defined(__ARM_ARCH_8M_BASE__)) && defined(__GNUC__)
 #define BODY_ARMV6M
@@ -78,7 +78,8 @@ struct layer {
 struct input {
     uint16_t scale;
     int16_t exponent; /* 1 / lsb = scale * 2^(142 - exponent) */
-    int16_t limit;    /* saturates at +-limit steps */
+    int16_t least;    /* in steps; beyond these it saturates */
+    int16_t most;
 };
 
 struct golden {
@@ -130,9 +131,13 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
     "add  %[" a "], %[t]\n\t"
 #define COLUMN(in, o0, o1, o2, o3) "ldrh %[in], [%[x], #" in "]\n\t" MAC(o0, "a0") MAC(o1, "a1") MAC(o2, "a2") MAC(o3, "a3")
 
+/* Two accumulators in low registers and two in those high ones that no compiler setting takes away. */
 static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
-    accumulator a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+    accumulator a0 = s->a0, a1 = s->a1;
+    register accumulator a2 __asm__("r12");
+    register accumulator a3 __asm__("r14");
     uint32_t in, t;
+    a2 = s->a2, a3 = s->a3;
     __asm__ volatile(
         ".syntax unified\n"
         "1:\n\t" COLUMN("0", "0", "4", "8", "12") COLUMN("2", "2", "6", "10", "14") COLUMN("4", "1", "5", "9", "13")
@@ -141,9 +146,9 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
         "adds %[x], %[x], #8\n\t"
         "cmp  %[x], %[last]\n\t"
         "bne  1b"
-        : [a0] "+h"(a0), [a1] "+h"(a1), [a2] "+h"(a2), [a3] "+h"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
+        : [a0] "+l"(a0), [a1] "+l"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
           [t] "=&l"(t)
-        : [last] "r"(last)
+        : [last] "l"(last)
         : "cc", "memory");
     s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
     return w;
@@ -196,10 +201,10 @@ static inline int32_t activated(int32_t z) {
 #ifdef SATURATE
     __asm__("usat %0, #15, %1" : "=r"(z) : "r"(z));
     return z;
-#else /* without a branch */
-    z &= ~(z >> 31);
+#else /* without branches */
+    z &= (int32_t)((uint32_t)z >> 31) - 1; /* what is negative becomes 0 */
     z -= 32767;
-    z &= z >> 31;
+    z &= -(int32_t)((uint32_t)z >> 31); /* and what is beyond 32767 becomes that */
     return z + 32767;
 #endif
 }
@@ -292,8 +297,8 @@ static int16_t action(activation y, int i) {
 
 /* Put one input in its place, saturated; 1 if that changed it. */
 static int put(union activations *x, int i, int32_t q) {
-    const int32_t limit = inputs[i].limit;
-    const int32_t within = q > limit ? limit : q < -limit ? -limit : q;
+    const int32_t least = inputs[i].least, most = inputs[i].most;
+    const int32_t within = q > most ? most : q < least ? least : q;
     x->one[i] = (activation)(within + OFFSET);
     return within != q;
 }
@@ -355,26 +360,24 @@ int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_
 }
 
 int qrl_policy_selftest(void) {
+    static const union {
+        uint32_t bits[QRL_POLICY_OBS_SIZE];
+        float obs[QRL_POLICY_OBS_SIZE];
+    } not_a_number = {{0x7fc00000u}};
+    float act[QRL_POLICY_ACT_SIZE];
     for (int k = 0; k < GOLDENS; ++k) {
-        float act[QRL_POLICY_ACT_SIZE];
         int16_t act_i16[QRL_POLICY_ACT_SIZE];
         int wrong = qrl_policy_step(goldens[k].obs, act) != goldens[k].status;
         wrong |= qrl_policy_step_i16(goldens[k].obs_i16, act_i16) != goldens[k].status_i16;
         for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
-            wrong |= act_i16[i] != goldens[k].act[i];
-            wrong |= !(act[i] == (float)goldens[k].act[i] * act_lsb[i]);
+            const volatile float wanted = (float)goldens[k].act[i] * act_lsb[i]; /* rounded, whatever registers hold */
+            wrong |= act_i16[i] != goldens[k].act[i] || !(act[i] == wanted);
         }
         if (wrong) {
             return k + 1;
         }
     }
-    const union {
-        uint32_t bits;
-        float real;
-    } nan = {0x7fc00000u};
-    float obs[QRL_POLICY_OBS_SIZE] = {0}, act[QRL_POLICY_ACT_SIZE];
-    obs[QRL_POLICY_OBS_SIZE - 1] = nan.real;
-    int wrong = qrl_policy_step(obs, act) != 2;
+    int wrong = qrl_policy_step(not_a_number.obs, act) != 2;
     for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
         wrong |= !(act[i] == act_safe[i]);
     }

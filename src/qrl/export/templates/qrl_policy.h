@@ -2,12 +2,12 @@
 @banner@
  *
  * Call once every @period_s@ s, the period the policy was trained with.
- * World and body frames: x forward, y left, z up. SI units.
- *
+@frames@
 @ports@
  *
  * lsb: what one step of the integer entry is worth. range: inputs beyond it are clipped, and the status is 1.
- * Needs C99, no library, no heap; keeps no state, so it may be called from anywhere. Stack and cycles: report.md.
+ * C99, no libm, no heap, no state. Without an FPU the float entry calls the compiler's own float routines, for its
+ * outputs alone; the integer entry calls none. Stack and instructions: report.md.
  * The code in this folder may be used without restriction, in whatever product and under whatever licence.
  */
 #ifndef QRL_POLICY_H
@@ -28,8 +28,11 @@ enum {
 @places@
 };
 
-/* For the integer entry, as initialisers: float obs_lsb[] = QRL_POLICY_OBS_LSB; */
+/* For the integer entry, as initialisers: static const float obs_lsb[] = {QRL_POLICY_OBS_LSB}; an input is
+   value / lsb, rounded and saturated to [least, most] before it is cast: in C a cast out of range is undefined. */
 #define QRL_POLICY_OBS_LSB @obs_lsb@
+#define QRL_POLICY_OBS_LEAST @obs_least@
+#define QRL_POLICY_OBS_MOST @obs_most@
 #define QRL_POLICY_ACT_LSB @act_lsb@
 
 /* SI units. Returns 0; or 1: an input was clipped to its range; or 2: an input was not finite, and act holds the

@@ -4,7 +4,7 @@
 #include "qrl_policy.h"
 
 static void read_sensors(float obs[QRL_POLICY_OBS_SIZE]) {
-    static const float example[QRL_POLICY_OBS_SIZE] = @example_obs@;
+    static const float example[QRL_POLICY_OBS_SIZE] = {@example_obs@};
     for (int i = 0; i < QRL_POLICY_OBS_SIZE; ++i) {
         obs[i] = example[i]; /* yours: the state estimate, in the order, units and frames of qrl_policy.h */
     }
@@ -12,7 +12,7 @@ static void read_sensors(float obs[QRL_POLICY_OBS_SIZE]) {
 
 static void drive(const float act[QRL_POLICY_ACT_SIZE]) {
     for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
-        printf("%s%.4f", i ? " " : "@act_names@: ", (double)act[i]); /* yours: thrust to motor command */
+        printf("%s%.4f", i ? " " : "@act_names@: ", (double)act[i]); /* yours: to the actuators */
     }
     printf("\n");
 }
