@@ -165,6 +165,13 @@ WRONG: dict[str, tuple[dict, str]] = {
     "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"judged is the same for all points"),
     "duplicate values": ({"axes": {"gamma": [0.9, 0.9]}}, r"expected each point once, found gamma 0.9 and gamma 0.9"),
     "duplicate by another way": ({"axes": {"lanes": [16, 16.0]}}, r"each point once, found lanes 16.0 and lanes 16"),
+    "called like a column": (
+        {"axes": {"seeds": {"a": {"gamma": 0.9}}}},
+        r"key 'axes.seeds': expected another name than that of a column of results.csv, found 'seeds'",
+    ),
+    "called like a measure": ({"axes": {"rms_angle_rad": {"a": {"gamma": 0.9}}}}, r"another name than .* 'rms_angle"),
+    "an axis without a name": ({"axes": {"": {"a": {"gamma": 0.9}}}}, r"expected a name for the axis, found \"\""),
+    "settings without a name": ({"axes": {"m": {"": {"gamma": 0.9}}}}, r"'axes.m': expected a name for each of its"),
     "fixed and axis": ({"axes": GAMMA, "fixed": {"gamma": 0.9}}, r"'axes.gamma': 'gamma' is set in 'fixed' too"),
     "two axes": ({"axes": {**GAMMA, "m": {"a": {"gamma": 0.5}}}}, r"'gamma' is set in 'axes.gamma' too"),
     "range upside down": (

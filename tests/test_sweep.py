@@ -129,6 +129,14 @@ def test_results_hold_every_point_and_seed(done: Path) -> None:
     assert [r["env_steps"] for r in rows_of(done / "curves.csv")] == ["200", "400"] * 12
 
 
+def test_no_axis_may_be_called_like_a_column(done: Path, tmp_path: Path) -> None:
+    with (done / "results.csv").open() as file:
+        columns = set(csv.DictReader(file).fieldnames or ())
+    for name in columns - AXES.keys():
+        with pytest.raises(BadInput, match="another name"):
+            load(write_grid(tmp_path, {name: {"a": {"gamma": 0.9}}}), 1e9)
+
+
 def test_best_json_repeats_its_row_bit_for_bit(done: Path, tmp_path: Path) -> None:
     """The winner, trained by itself, makes the same metrics.csv that the sweep's member made."""
     assert qrl("train", "--config", done / "best.json", "--out", tmp_path / "best") == 0
@@ -254,6 +262,21 @@ def test_a_folder_of_something_else_is_refused(done: Path, tmp_path: Path, capsy
     assert "it is a file" in complaint(capsys, "sweep", other, "--out", other)
 
 
+def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever it raises reaches whoever runs the sweep."""
+
+    def chunk(*_: Any) -> Any:
+        raise IndexError("of our own")
+
+    grid = load(write_grid(tmp_path, {"gamma": [0.9]}), 1e9)
+    env, config = worlds.make("pendulum"), grid.points[0].learner
+    group = Group(Trainer(env, config), [Member(0, 0, point(env, config))])
+    monkeypatch.setattr(sweep, "_compiled", lambda *_: None)
+    monkeypatch.setattr(sweep, "_chunk", chunk)
+    with pytest.raises(IndexError, match="of our own"):
+        list(sweep.run(group, jax.devices(), 1e9, tmp_path / "chunks", lambda: False))
+
+
 # -- memory --------------------------------------------------------------------------------------------------
 
 
@@ -355,6 +378,34 @@ def test_success_ranks_before_return_and_the_middle_seed_repeats(three_points: A
     assert results.best(findings, found, 4) == 1
     assert [f["point"] for f in results.ranked(findings)] == [1, 2, 0]
     assert results.repeat(three_points, found, 1).seed == 3  # of returns 4, 1, 3, 2 the lower median, 2
+
+
+@pytest.mark.parametrize(
+    ("values", "quartiles"),
+    [
+        ([1.0, 2.0, np.inf], (2.0, 1.5, np.inf)),
+        ([1.0, np.inf, np.inf], (np.inf, np.inf, np.inf)),
+        ([-np.inf, -np.inf, 3.0, 5.0], (-np.inf, -np.inf, 3.5)),
+        ([1.0, 2.0, np.nan], (np.nan, np.nan, np.nan)),
+    ],
+)
+def test_quartiles_of_infinities(values: list[float], quartiles: tuple) -> None:
+    found = results._quartiles(values)
+    np.testing.assert_equal((found["median"], found["q1"], found["q3"]), quartiles)
+
+
+def test_a_seed_that_diverged_never_settled(three_points: Any) -> None:
+    """It is the worst in every measure; a success that nobody measured stays unmeasured."""
+    found = {i: result(1.0, diverged="NaN" * (i < 5)) for i in range(12)}
+    for kept in found.values():
+        kept.rows[0]["settle_median_s"] = kept.rows[0]["rms_m"] = 2.0
+    findings = results.findings(three_points, found)
+    for name in ("settle_median_s", "rms_m"):
+        assert [(f[name]["median"], f[name]["q3"]) for f in findings] == [(np.inf, np.inf), (2.0, np.inf), (2.0, 2.0)]
+    assert all(np.isnan(f["success"]["median"]) for f in findings)
+    assert [f["point"] for f in results.ranked(findings)] == [1, 2, 0]
+    found[11].rows[0]["success"] = 0.0
+    assert results.findings(three_points, found)[0]["success"]["median"] == 0.0
 
 
 def test_where_all_diverge_there_is_no_best(three_points: Any) -> None:

@@ -10,11 +10,18 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from qrl.config import Config
+from qrl.learner import Terms
 from qrl.runs import TaskRecord
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput, Count, Real, Spec
 
 DIGITS = 6  # to which the values of a range are rounded: enough to tell them apart, few enough to read
+# What a table of results calls its own columns; and whatever begins so.
+COLUMNS = (
+    *("point", "seed", "seeds", "diverged", "env_steps", "updates", "return_mean", "return_min", "success"),
+    *("train_seconds", "steps_per_second", "reward_mean", "ended_early", *Terms._fields),
+)
+MEASURES = ("settle_", "rms_")
 JUDGED = "task.evaluation"  # the same for all points, else they could not be compared
 
 
@@ -109,6 +116,7 @@ def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) 
     if all(isinstance(inner, dict) for inner in value.values()):
         if name in known:
             raise BadInput(f"{key}: expected another name for named settings than that of a setting")
+        _refuse_title(name, value, key)
         return Axis(tuple(value), value)
     span = specfile.build(Range, value, f"{where}: axes.{name}")
     if (span.count is None) != sampled:
@@ -117,6 +125,13 @@ def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) 
     if span.count == 1:
         raise BadInput(f"{key}: expected a range of at least 2 values, found count 1")
     return span if span.count is None else Axis(tuple(span.at(i / (span.count - 1)) for i in range(span.count)))
+
+
+def _refuse_title(name: str, settings: dict[str, Any], key: str) -> None:
+    if not name or "" in settings:
+        raise BadInput(f'{key}: expected a name for {"each of its settings" if name else "the axis"}, found ""')
+    if name in COLUMNS or name.startswith(MEASURES):
+        raise BadInput(f"{key}: expected another name than that of a column of results.csv, found '{name}'")
 
 
 def refuse_clashes(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:

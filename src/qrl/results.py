@@ -14,7 +14,9 @@ from qrl.runs import RunConfig
 from qrl.sweep import Result
 
 CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
-Finding = dict[str, Any]  # of one point: place, how many seeds diverged, quartiles of each number of the last report
+Finding = dict[
+    str, Any
+]  # of one point: place, seeds, how many diverged, quartiles of each number of the last report
 
 
 def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
@@ -53,29 +55,43 @@ def _squared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def findings(grid: Grid, results: dict[int, Result]) -> list[Finding]:
     """For each point the quartiles over its seeds; a seed that diverged counts as the worst there could be."""
+    measured = any(math.isfinite(row["success"]) for result in results.values() for row in result.rows[-1:])
     found = []
     for i, point in enumerate(grid.points):
         seeds = [results[i * len(grid.seeds) + j] for j in range(len(grid.seeds))]
         numbers = {
-            name: _quartiles([_worst(name) if seed.diverged else seed.rows[-1][name] for seed in seeds])
+            name: _quartiles([_worst(name, measured) if seed.diverged else seed.rows[-1][name] for seed in seeds])
             for name in seeds[0].rows[-1]
             if name not in ("env_steps", "updates")
         }
-        found.append({"point": i, "at": point.place, "diverged": sum(bool(s.diverged) for s in seeds), **numbers})
+        sick = sum(bool(seed.diverged) for seed in seeds)
+        found.append({"point": i, "at": point.place, "seeds": len(seeds), "diverged": sick, **numbers})
     return found
 
 
-def _worst(name: str) -> float:
-    return {"success": 0.0, "return_mean": -math.inf, "return_min": -math.inf}.get(name, math.nan)
+def _worst(name: str, measured: bool) -> float:
+    if name.startswith(("settle_", "rms_")):
+        return math.inf
+    return {"success": 0.0 if measured else math.nan, "return_mean": -math.inf, "return_min": -math.inf}.get(
+        name, math.nan
+    )
 
 
 def _quartiles(values: list[float]) -> dict[str, float]:
-    finite = np.asarray(values, np.float64)
-    with np.errstate(invalid="ignore"):
-        low, median, high = np.quantile(finite, [0.25, 0.5, 0.75])
-    if np.isneginf(finite).any():  # between the worst and a number lies no number: the worst
-        low, median, high = (-math.inf if math.isnan(q) else q for q in (low, median, high))
-    return {"median": float(median), "q1": float(low), "q3": float(high)}
+    ordered = np.sort(np.asarray(values, np.float64))  # NaN last
+    return {name: _quantile(ordered, share) for name, share in (("median", 0.5), ("q1", 0.25), ("q3", 0.75))}
+
+
+def _quantile(ordered: Any, share: float) -> float:
+    """As NumPy has it, but of infinities too: between an infinity and a number lies that infinity."""
+    if np.isfinite(ordered).all() or np.isnan(ordered[-1]):
+        return float(np.quantile(ordered, share))
+    place = share * (len(ordered) - 1)
+    low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    if low == high:  # one place, or the same infinity
+        return low
+    fraction = place - math.floor(place)
+    return low * (1 - fraction) + high * fraction
 
 
 def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | None:
@@ -84,8 +100,9 @@ def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | 
     return max(alive, key=_rank)["point"] if alive else None
 
 
-def _rank(finding: Finding) -> tuple[float, float]:
-    return _number(finding["success"]["median"]), _number(finding["return_mean"]["median"])
+def _rank(finding: Finding) -> tuple[bool, float, float]:
+    alive = finding["diverged"] < finding["seeds"]
+    return alive, _number(finding["success"]["median"]), _number(finding["return_mean"]["median"])
 
 
 def _number(value: float) -> float:

@@ -131,10 +131,9 @@ def run(
 
     def work(worker: int, device: Any) -> None:
         try:
-            with suppress(IndexError):  # no chunk left
-                while not halt.is_set():
-                    for event in _chunk(group, programs[device], chunks.popleft(), size, device, folder, halt.is_set):
-                        events.put(event(worker))
+            while not halt.is_set() and (members := _next(chunks)):
+                for event in _chunk(group, programs[device], members, size, device, folder, halt.is_set):
+                    events.put(event(worker))
             events.put(None)
         except BaseException as error:
             events.put(error)
@@ -158,6 +157,13 @@ def run(
         halt.set()
         for thread in threads:  # to the end of its lap: Python must not end while it is inside XLA
             thread.join()
+
+
+def _next(chunks: deque[list[Member]]) -> list[Member]:
+    """A chunk for whoever asks first; none left: empty."""
+    with suppress(IndexError):
+        return chunks.popleft()
+    return []
 
 
 def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
