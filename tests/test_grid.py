@@ -196,8 +196,13 @@ WRONG: dict[str, tuple[dict, str]] = {
     "seeds of a wrong type": ({"axes": GAMMA, "seeds": "four"}, r"key 'seeds': expected .* found \"four\""),
     "too large": (
         {"axes": {name: {"from": 0.1, "to": 0.9, "count": 1000} for name in ("gamma", "lam", "sigma")}},
-        r"fits into 1 GB of memory, found 1,000,000,000 points, which need 20,000.0 GB",
+        r"fits into 1 GB of memory, found 1,000,000,000 points × 1 seeds, which need 95,000.0 GB",
     ),
+    "a range too long to be listed": (
+        {"axes": {"gamma": {"from": 0.1, "to": 0.9, "count": 2_000_000_000}}},
+        r"found 2,000,000,000 points × 1 seeds, which need 190,000.0 GB",
+    ),
+    "too many seeds": ({"axes": GAMMA, "seeds": 1_000_000}, r"found 2 points × 1,000,000 seeds, which need 150.0 GB"),
 }
 
 

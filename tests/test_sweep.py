@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 
-from qrl import loop, processes, results, sweep, sweep_plot, train
+from qrl import loop, processes, results, sweep, sweep_command, sweep_plot, train
 from qrl.cli import main
 from qrl.grid import load
 from qrl.sweep import Group, Member, Result
@@ -250,6 +250,31 @@ def test_ctrl_c_ends_with_exit_code_1_and_keeps_its_chunks(tmp_path: Path) -> No
     assert "the same command goes on" in out
     assert 0 < len(sweep.finished(tmp_path / "out" / "chunks")) < 400
     assert not (tmp_path / "out" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("text", ["", '{"members": {"0": {"rows": [], "diverged": ""}}}'])
+def test_a_chunk_that_cannot_be_read_is_made_anew(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str
+) -> None:
+    """As a full disk or a crash may leave one: it is said, once, and the results are the same."""
+    out = tmp_path / "out"
+    (out / "chunks").mkdir(parents=True)
+    for path in [done / "grid.json", *(done / "chunks").glob("*.json")]:
+        (out / path.relative_to(done)).write_bytes(path.read_bytes())
+    (out / "chunks" / "0000003.json").write_text(text)
+    capsys.readouterr()
+    assert qrl("sweep", write_grid(tmp_path, AXES), "--out", out) == 0
+    assert " ".join(capsys.readouterr().out.split()).count("cannot be read; its members are made anew") == 1
+    assert rows_of(out / "results.csv") == rows_of(done / "results.csv")
+
+
+def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid, out = write_grid(tmp_path, {"gamma": [0.9]}), tmp_path / "out"
+    with sweep_command._locked(out, processes.Process(0, 1, "")):
+        assert "another sweep is at work in" in complaint(capsys, "sweep", grid, "--out", out)
+        with sweep_command._locked(out, processes.Process(1, 2, "")):  # one of several
+            pass
+    assert not (out / "grid.json").exists()
 
 
 def test_a_folder_of_something_else_is_refused(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

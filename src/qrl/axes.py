@@ -39,6 +39,10 @@ class Axis:
         """The settings that this axis sets."""
         return list(dict.fromkeys(key for s in self.named.values() for key in s)) if self.named is not None else [name]
 
+    @property
+    def size(self) -> int:
+        return len(self.values)
+
     def draw(self, rng: np.random.Generator) -> Any:
         return self.values[rng.integers(len(self.values))]
 
@@ -64,6 +68,15 @@ class Range(Spec):
 
     def names(self, name: str) -> list[str]:
         return [name]
+
+    @property
+    def size(self) -> int:
+        return self.count or 1
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Made when asked for: of two thousand million only the number is looked at."""
+        return tuple(self.at(i / (self.size - 1)) for i in range(self.size))
 
     def at(self, share: float) -> float:
         """The number a fraction `share` of the way from `from` to `to`."""
@@ -124,7 +137,7 @@ def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) 
         raise BadInput(f"{key}: expected {expected}, found {json.dumps(value)}")
     if span.count == 1:
         raise BadInput(f"{key}: expected a range of at least 2 values, found count 1")
-    return span if span.count is None else Axis(tuple(span.at(i / (span.count - 1)) for i in range(span.count)))
+    return span
 
 
 def _refuse_title(name: str, settings: dict[str, Any], key: str) -> None:

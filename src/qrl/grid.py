@@ -19,6 +19,7 @@ from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput, Spec
 
 POINT_BYTES = 20_000  # of host memory for each point: read (6 kB measured), its arrays, its record in grid.json
+REPORT_BYTES = 3_000  # and for each report of a member: a row of some twenty numbers, once more as text
 
 
 class Sample(Spec):
@@ -105,11 +106,14 @@ def load(path: Path, budget_bytes: float) -> Grid:
         name: axis(name, value, known, str(path), sampled=file.sample is not None) for name, value in file.axes.items()
     }
     refuse_clashes(file.fixed, axes, known, str(path))
-    count = file.sample.count if file.sample else math.prod(len(a.values) for a in axes.values() if isinstance(a, Axis))
-    if count * POINT_BYTES > budget_bytes:
+    count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
+    reports = file.fixed.get("reports", request.preset(task)["reports"])
+    kept = len(file.seeds) * REPORT_BYTES * (int(reports) if isinstance(reports, int | float) and reports >= 1 else 1)
+    need = count * (POINT_BYTES + kept)
+    if need > budget_bytes:
         raise BadInput(
-            f"{path}: expected a grid that fits into {budget_bytes / 1e9:g} GB of memory, found {count:,} points,"
-            f" which need {count * POINT_BYTES / 1e9:,.1f} GB"
+            f"{path}: expected a grid that fits into {budget_bytes / 1e9:g} GB of memory, found {count:,} points"
+            f" × {len(file.seeds):,} seeds, which need {need / 1e9:,.1f} GB"
         )
     places = _sampled(axes, file.sample, str(path)) if file.sample else _product(axes)
     points: dict[str, GridPoint] = {}

@@ -14,9 +14,7 @@ from qrl.runs import RunConfig
 from qrl.sweep import Result
 
 CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
-Finding = dict[
-    str, Any
-]  # of one point: place, seeds, how many diverged, quartiles of each number of the last report
+Finding = dict[str, Any]  # of one point: place, seeds, how many diverged, quartiles of each number of the last report
 
 
 def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:

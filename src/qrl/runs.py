@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import os
 import subprocess
 from importlib import metadata, resources
 from pathlib import Path
@@ -104,8 +105,11 @@ def write_json(path: Path, data: Any) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Write a file under another name and rename it: whoever reads sees the old one or the new one, whole."""
-    temporary = path.with_name(path.name + ".tmp")
-    temporary.write_text(text, encoding="utf-8")
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # nobody else's, should two write the same file
+    with temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())  # a name that outlives a crash must not point at what did not
     temporary.replace(path)
 
 

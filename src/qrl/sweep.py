@@ -224,11 +224,22 @@ def _record(path: Path, results: dict[int, Result]) -> None:
     replace_text(path, json.dumps({"members": members}) + "\n")
 
 
-def finished(folder: Path) -> dict[int, Result]:
-    """The results in a sweep's folder of chunks, by member."""
+def finished(folder: Path, unreadable: Callable[[Path], None] = lambda path: None) -> dict[int, Result]:
+    """The results in a sweep's folder of chunks, by member. What cannot be read is as if it had not been made."""
     results = {}
     for path in sorted(folder.glob("*.json")):
-        for index, kept in json.loads(path.read_text(encoding="utf-8"))["members"].items():
-            rows = [{k: float(v) if isinstance(v, str) else v for k, v in row.items()} for row in kept["rows"]]
-            results[int(index)] = Result(rows, kept["diverged"])
+        try:
+            results |= _recorded(path)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+            unreadable(path)
     return results
+
+
+def _recorded(path: Path) -> dict[int, Result]:
+    found = {}
+    for index, kept in json.loads(path.read_text(encoding="utf-8"))["members"].items():
+        rows = [{k: float(v) if isinstance(v, str) else v for k, v in row.items()} for row in kept["rows"]]
+        if not rows:
+            raise ValueError("no report")
+        found[int(index)] = Result(rows, kept["diverged"])
+    return found

@@ -1,10 +1,12 @@
 """The command `sweep`: a grid file to a folder of results; the same command goes on with an interrupted one."""
 
 import argparse
+import fcntl
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +40,21 @@ def sweep(args: argparse.Namespace) -> int:
         console.print(f"{out}: finished already; nothing to do")
         return DONE
     groups = _groups(grid, process, budget, args.grid)
-    _prepare(out, grid, process, held)
+    with _locked(out, process):
+        return _work(args, began, process, budget, grid, groups, out)
+
+
+def _work(
+    args: argparse.Namespace,
+    began: float,
+    process: Process,
+    budget: float,
+    grid: Grid,
+    groups: list[Group],
+    out: Path,
+) -> int:
+    """What is done while nobody else may: train what is left, and write what was found."""
+    _prepare(out, grid, process, _held(out, grid))
     total = len(grid.points) * len(grid.seeds)
     console.print(
         f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
@@ -54,6 +70,20 @@ def sweep(args: argparse.Namespace) -> int:
     if process.number:
         return DONE  # process 0 writes the results
     return _finish(out, grid, found, args.grid.stem, time.perf_counter() - began)
+
+
+@contextmanager
+def _locked(out: Path, process: Process) -> Iterator[None]:
+    """The folder, for this process number alone; BadInput if another command holds it."""
+    out.mkdir(parents=True, exist_ok=True)
+    with (out / f"process-{process.number}.lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BadInput(f"{out}: another sweep is at work in it; wait for its end, or give another OUT") from None
+        except OSError:
+            pass  # a file system without locks
+        yield
 
 
 def _held(out: Path, grid: Grid) -> bool:
@@ -95,7 +125,6 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
 
 
 def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
-    out.mkdir(parents=True, exist_ok=True)
     if not held and process.number == 0:
         devices = [str(device) for device in jax.devices()]
         runs.write_json(out / "grid.json", {**grid.record, "versions": runs.versions(), "devices": devices})
@@ -104,7 +133,9 @@ def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
 def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
     """Run every group, and show how far it is: a line a chunk, and a bar in between."""
     work = sum(len(group.members) * group.steps for group in groups)
-    kept = members_of.finished(out / "chunks")
+    kept = members_of.finished(
+        out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are made anew")
+    )
     mine = [group.steps for group in groups for member in group.members if member.number in kept]
     done = before = sum(mine)
     count, total = len(mine), sum(len(group.members) for group in groups)
