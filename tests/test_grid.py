@@ -125,7 +125,6 @@ def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
         ("observation_scale", [None, [1.0] * 18], 2),
         ("xi", [0.1, 0.2], 1),
         ("xi", [None, 0.2], 2),
-        ("task.control_period_s", [0.01, 0.02], 2),
         ("task.episode_steps", [100, 200], 2),
         ("form", ["ratio", "difference"], 2),
         ("minibatch_lanes", [8, 16], 2),
@@ -134,6 +133,19 @@ def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
 def test_only_static_values_make_programs(tmp_path: Path, axis: str, values: list, programs: int) -> None:
     """Numbers travel; shapes, counts, choices and whether an optional one is there make groups."""
     assert len(load(tmp_path, {"task": "hover", "axes": {axis: values}}).groups()) == programs
+
+
+def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -> None:
+    """Null starts and rewards of an evaluation are those of training; ours, which say theirs, may train otherwise."""
+    evaluation = {"start": None, "reward": None}
+    task = tmp_path / "task.json"
+    task.write_text(json.dumps({"extend": "pendulum", "evaluation": evaluation}))
+    for axis, what in (("task.reward.w_torque_1_N2m2", "reward"), ("task.start.angle_rad", "start")):
+        axes = {axis: [0.1, 0.2]}
+        assert len(load(tmp_path, {"task": "pendulum", "axes": axes}).points) == 2
+        with pytest.raises(BadInput, match=f"judged alike, found another {what}"):
+            load(tmp_path, {"task": str(task), "axes": axes})
+    load(tmp_path, {"task": "pendulum", "axes": {"episode_steps": [100, 200]}})
 
 
 GAMMA = {"gamma": [0.9, 0.99]}
@@ -172,6 +184,31 @@ WRONG: dict[str, tuple[dict, str]] = {
     "called like a measure": ({"axes": {"rms_angle_rad": {"a": {"gamma": 0.9}}}}, r"another name than .* 'rms_angle"),
     "an axis without a name": ({"axes": {"": {"a": {"gamma": 0.9}}}}, r"expected a name for the axis, found \"\""),
     "settings without a name": ({"axes": {"m": {"": {"gamma": 0.9}}}}, r"'axes.m': expected a name for each of its"),
+    "too large for single precision": (
+        {"axes": {"sigma": [0.5, 1e300]}},
+        r"at sigma 1e\+300: key 'sigma': expected a magnitude that single precision holds",
+    ),
+    "too small for single precision": ({"axes": {"xi": [1e-60]}}, r"at xi 1e-60: key 'xi': .* single precision holds"),
+    "the same in single precision": (
+        {"axes": {"gamma": [0.9, 0.900000001]}},
+        r"each point once, found gamma 0.900000001 and gamma 0.9, the same in single precision",
+    ),
+    "another period": (
+        {"axes": {"task.control_period_s": [0.05, 0.02]}},
+        r"judged alike, found another control period of its flights at task.control_period_s 0.05 and at",
+    ),
+    "returns of other lengths": (
+        {"axes": {"task.episode_steps": [200, 100]}},
+        r"judged alike, found another number of steps of its return at task.episode_steps 200 and at",
+    ),
+    "flights of other lengths": (
+        {"task": "inverted_pendulum", "axes": {"episode_steps": [200, 100]}},
+        r"judged alike, found another length of a flight \(episode_steps\) at episode_steps 200 and at",
+    ),
+    "other starts": (
+        {"axes": {"report_flights": [10, 20]}},
+        r"judged alike, found another number of flights",
+    ),
     "fixed and axis": ({"axes": GAMMA, "fixed": {"gamma": 0.9}}, r"'axes.gamma': 'gamma' is set in 'fixed' too"),
     "two axes": ({"axes": {**GAMMA, "m": {"a": {"gamma": 0.5}}}}, r"'gamma' is set in 'axes.gamma' too"),
     "range upside down": (

@@ -277,6 +277,23 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path, capsys: pytest.Cap
     assert not (out / "grid.json").exists()
 
 
+def test_where_all_diverged_the_exit_code_is_1_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    grid, out = write_grid(tmp_path, {"learning_rate": [1e30]}), tmp_path / "out"
+    for _ in range(2):
+        assert qrl("sweep", grid, "--out", out) == 1
+        assert "every member diverged" in capsys.readouterr().err
+
+
+def test_a_plot_that_fails_costs_no_result(three_points: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise OSError("no fonts")
+
+    monkeypatch.setattr(sweep_plot, "sweep", fail)
+    with pytest.raises(OSError, match="no fonts"):
+        sweep_command._finish(tmp_path, three_points, {i: result(1.0) for i in range(12)}, "grid", 1.0)
+    assert all((tmp_path / name).exists() for name in ("results.csv", "curves.csv", "summary.json", "best.json"))
+
+
 def test_a_folder_of_something_else_is_refused(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     other = write_grid(tmp_path, {"gamma": [0.9]})
     assert "another grid" in complaint(capsys, "sweep", other, "--out", done)
@@ -498,12 +515,21 @@ def test_a_process_knows_which_it_is(flags: tuple, env: dict, expected: tuple) -
         ((2, 2, "h:1"), {}, "--process-id below --processes, found 2 of 2"),
         ((1, None, "h:1"), {}, "--process-id below --processes"),
         ((0, 2, None), {}, "--coordinator is missing"),
+        ((None, None, "h:1"), {}, "--processes is missing"),
         ((None, None, None), {"JAX_PROCESS_ID": "one"}, "--process-id: expected a number, found 'one'"),
     ],
 )
 def test_a_process_that_cannot_know_is_refused(flags: tuple, env: dict, words: str) -> None:
     with pytest.raises(BadInput, match=words):
         processes.this_process(*flags, env)
+
+
+def test_a_wrong_grid_is_refused_before_the_others_are_waited_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "join", lambda process: pytest.fail("joined"))
+    several = ("--processes", "2", "--process-id", "0", "--coordinator", "127.0.0.1:1")
+    assert "unknown key 'gama'" in complaint(capsys, "sweep", write_grid(tmp_path, {"gama": [0.9]}), *several)
 
 
 def test_two_processes_share_a_sweep(done: Path, tmp_path: Path) -> None:

@@ -62,6 +62,22 @@ class GridPoint:
         form = spec.get("reward", {}).get("form")
         return json.dumps([self.task.name, fixed, form, self.learner.static], sort_keys=True)
 
+    @property
+    def judged(self) -> dict[str, Any]:
+        """How a report judges this point, as `evaluation()` of its environment and `fly` resolve it."""
+        flights = {"number of flights (report_flights)": self.learner.report_flights}
+        spec = self.task.spec
+        if spec is None:
+            return flights | {"length of a flight (episode_steps)": self.learner.episode_steps}
+        plan = spec["evaluation"]
+        return flights | {
+            "control period of its flights": spec["control_period_s"],
+            "number of steps of its return": plan.get("return_steps", spec["episode_steps"]),
+            "start of its flights": plan.get("start", spec["start"]),
+            "reward of its return": plan.get("reward", spec["reward"]),
+            "evaluation": plan,
+        }
+
 
 @dataclass(frozen=True)
 class Grid:
@@ -108,7 +124,11 @@ def load(path: Path, budget_bytes: float) -> Grid:
     refuse_clashes(file.fixed, axes, known, str(path))
     count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
     reports = file.fixed.get("reports", request.preset(task)["reports"])
-    kept = len(file.seeds) * REPORT_BYTES * (int(reports) if isinstance(reports, int | float) and reports >= 1 else 1)
+    kept = (
+        len(file.seeds)
+        * REPORT_BYTES
+        * (int(reports) if isinstance(reports, int | float) and 1 <= reports < 2**31 else 1)
+    )
     need = count * (POINT_BYTES + kept)
     if need > budget_bytes:
         raise BadInput(
@@ -119,11 +139,30 @@ def load(path: Path, budget_bytes: float) -> Grid:
     points: dict[str, GridPoint] = {}
     for place in places:
         point = _point(task, file.fixed, axes, place, str(path))
-        key = json.dumps([point.task.spec, point.learner.model_dump(mode="json")], sort_keys=True)
+        key = _in_single([point.task.spec, point.learner.model_dump(mode="json")])
         if key in points:
-            raise BadInput(f"{path}: expected each point once, found {said(place)} and {said(points[key].place)}")
+            raise BadInput(
+                f"{path}: expected each point once, found {said(place)} and {said(points[key].place)},"
+                " the same in single precision"
+            )
         points[key] = point
+        _refuse_other_judge(next(iter(points.values())), point, str(path))
     return Grid(file, axes, list(points.values()))
+
+
+def _in_single(value: Any) -> str:
+    """A JSON value as the program sees it: its numbers in single precision."""
+    return json.dumps(json.loads(json.dumps(value), parse_float=lambda text: float(np.float32(text))), sort_keys=True)
+
+
+def _refuse_other_judge(first: GridPoint, point: GridPoint, where: str) -> None:
+    """BadInput if two points are not judged alike: what they reach could not be compared."""
+    for name, value in first.judged.items():
+        if point.judged[name] != value:
+            raise BadInput(
+                f"{where}: expected points that are judged alike, found another {name}"
+                f" at {said(first.place)} and at {said(point.place)}"
+            )
 
 
 def said(place: dict[str, Any]) -> str:

@@ -26,6 +26,8 @@ def this_process(index: int | None, count: int | None, coordinator: str | None, 
         ("--processes", count, env.get("JAX_NUM_PROCESSES"), step.get("SLURM_STEP_NUM_TASKS")),
     ]
     index, count = (_number(flag, next((v for v in values if v is not None), None)) for flag, *values in found)
+    if coordinator and count is None and index is None:
+        raise BadInput("--processes is missing: expected how many share the sweep, where there is a --coordinator")
     coordinator = coordinator or env.get("JAX_COORDINATOR_ADDRESS") or ""
     if count is None and index is None:
         return Process(0, 1, "")
@@ -73,5 +75,10 @@ def memory_bytes() -> float:
     """The memory that a sweep takes where nobody says otherwise: half of what the devices have."""
     first = jax.local_devices()[0]
     if first.platform == "cpu":
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2
+        return host_bytes()
     return (first.memory_stats() or {}).get("bytes_limit", 8e9) * len(jax.local_devices()) / 2
+
+
+def host_bytes() -> float:
+    """Half of this machine's memory; asks no device, which must not be done before `join`."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2

@@ -31,14 +31,15 @@ POLL_SECONDS = 0.5  # between two looks at what the other processes have finishe
 def sweep(args: argparse.Namespace) -> int:
     began = time.perf_counter()
     process = processes.this_process(args.process_id, args.processes, args.coordinator, os.environ)
+    given = args.memory_gb * 1e9 if args.memory_gb is not None else None
+    grid = grids.load(args.grid, given or processes.host_bytes())  # before the others are waited for
     processes.join(process)
-    budget = args.memory_gb * 1e9 if args.memory_gb is not None else processes.memory_bytes()
-    grid = grids.load(args.grid, budget)
+    budget = given or processes.memory_bytes()
     out: Path = args.out or Path("runs") / args.grid.stem
     held = _held(out, grid)
-    if held and (out / "summary.json").exists():
+    if held and (out / "summary.json").exists() and (out / "sweep.png").exists():
         console.print(f"{out}: finished already; nothing to do")
-        return DONE
+        return _ending(out)
     groups = _groups(grid, process, budget, args.grid)
     with _locked(out, process):
         return _work(args, began, process, budget, grid, groups, out)
@@ -185,17 +186,24 @@ def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], 
 
 def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
     findings = results.findings(grid, found)
-    sweep_plot.sweep(out / "sweep.png", findings, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
     results.write(out, grid, found, findings, seconds)
     _print_table(findings, len(grid.seeds))
-    if not (out / "best.json").exists():
-        complain(f"{out}: every member diverged; results.csv says where")
-        return FAILED
-    console.print(
-        f"done in {clock(seconds)}: {out}/results.csv, summary.json, sweep.png;"
-        f" the best point again: make train CONFIG={out}/best.json OUT=…"
-    )
-    return DONE
+    sweep_plot.sweep(out / "sweep.png", findings, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
+    code = _ending(out)
+    if code == DONE:
+        console.print(
+            f"done in {clock(seconds)}: {out}/results.csv, summary.json, sweep.png;"
+            f" the best point again: make train CONFIG={out}/best.json OUT=…"
+        )
+    return code
+
+
+def _ending(out: Path) -> int:
+    """The exit code of a finished sweep, the first time and every other."""
+    if (out / "best.json").exists():
+        return DONE
+    complain(f"{out}: every member diverged; results.csv says where")
+    return FAILED
 
 
 def _print_table(findings: list[results.Finding], seeds: int) -> None:
