@@ -7,18 +7,24 @@ shape the program.
 
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
-
-from qrl_envs.specfile import NonNegative, Positive, Real
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 
 def _whole(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+def _single(value: float) -> float:
+    if value and not 1e-30 <= abs(value) <= 1e30:
+        raise ValueError(f"expected a magnitude that single precision holds (1e-30 to 1e30), found {value}")
+    return value
+
+
 Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, lt=2**31)]  # accepts 2e6
 CountOrZero = Annotated[int, BeforeValidator(_whole), Field(ge=0, lt=2**31)]
-Fraction = Annotated[Real, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0), AfterValidator(_single)]
+NonNegative = Annotated[float, Field(ge=0), AfterValidator(_single)]
+Fraction = Annotated[float, Field(ge=0, le=1), AfterValidator(_single)]
 
 T = TypeVar("T")
 Traced = Annotated[T, "traced"]
