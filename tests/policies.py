@@ -63,7 +63,7 @@ def _ports(sizes: tuple[int, ...]) -> tuple[tuple[Observed, ...], tuple[Acted, .
 
 @cache
 def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0, samples: int = 1500) -> Policy:
-    """A lively policy of these layer sizes: actions spread over their range, a few of them clipped.
+    """A lively policy of these layer sizes: actions spread over their range, some of them clipped.
 
     The odd one normalises its observations and clips them, as a run with `normalise_observations` does.
     """
@@ -80,13 +80,16 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
         observation_gain=1.0 / flights.std(axis=0, dtype=float) if normalised else np.ones(sizes[0]),
         observation_clip=10.0 if normalised else np.inf,
         observation_scale=rng.uniform(0.25, 1.0, sizes[0]),
-        layers=tuple((rng.normal(size=(i, o)) * (2.0 / i) ** 0.5, 0.1 * rng.normal(size=o)) for i, o in pairwise(sizes)),
+        layers=tuple(
+            (rng.normal(size=(i, o)) * (2.0 / i) ** 0.5, 0.1 * rng.normal(size=o)) for i, o in pairwise(sizes)
+        ),
         activation=activation,
         calibration=flights,
     )
     *rest, (weight, bias) = made.layers
-    spread = outputs(made, flights).std(axis=0)
-    return replace(made, layers=(*rest, (0.7 * weight / spread, bias)))
+    a = outputs(made, flights)
+    weight, middle = 0.7 * weight / a.std(axis=0), 0.7 * (a - bias).mean(axis=0) / a.std(axis=0)
+    return replace(made, layers=(*rest, (weight, bias - middle)))
 
 
 def outputs(policy: Policy, observations: np.ndarray) -> np.ndarray:

@@ -13,9 +13,7 @@ CRAZYFLIE = Path(__file__).parents[1] / "experiments" / "vehicles" / "crazyflie.
 @pytest.mark.parametrize("name", ["hover", "circle"])
 def test_observations_of_a_quadrotor(name: str) -> None:
     found = ports.observations(tasks.load(name))
-    assert " ".join(port.name for port in found) == (
-        "r11 r12 r13 r21 r22 r23 r31 r32 r33 px py pz vx vy vz wx wy wz"
-    )
+    assert " ".join(port.name for port in found) == ("r11 r12 r13 r21 r22 r23 r31 r32 r33 px py pz vx vy vz wx wy wz")
     assert [port.unit for port in found] == ["1"] * 9 + ["m"] * 3 + ["m/s"] * 3 + ["rad/s"] * 3
     assert all(port.frame.startswith("body: ") for port in found[15:])
     assert found[1].frame.endswith("world x part of the body y axis")  # row-major, body -> world
