@@ -1,6 +1,9 @@
 """What tests share: programs of one shape are compiled once in a session, machines to run kernels on, a tiny run."""
 
+import os
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded; as the command line does
 
 import jax
 import pytest

@@ -63,7 +63,7 @@ def _ports(sizes: tuple[int, ...]) -> tuple[tuple[Observed, ...], tuple[Acted, .
 
 @cache
 def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0, samples: int = 1500) -> Policy:
-    """A lively policy of these layer sizes: actions spread over their range, a few of them clipped.
+    """A lively policy of these layer sizes: actions spread over their range, some of them clipped.
 
     The odd one normalises its observations and clips them, as a run with `normalise_observations` does.
     """
@@ -87,8 +87,9 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
         calibration=flights,
     )
     *rest, (weight, bias) = made.layers
-    spread = outputs(made, flights).std(axis=0)
-    return replace(made, layers=(*rest, (0.7 * weight / spread, bias)))
+    a = outputs(made, flights)
+    weight, middle = 0.7 * weight / a.std(axis=0), 0.7 * (a - bias).mean(axis=0) / a.std(axis=0)
+    return replace(made, layers=(*rest, (weight, bias - middle)))
 
 
 def outputs(policy: Policy, observations: np.ndarray) -> np.ndarray:

@@ -2,7 +2,9 @@
 
 import math
 import struct
+from dataclasses import replace
 from fractions import Fraction
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -69,7 +71,7 @@ def literal_network(kernel: Kernel, x: list[int]) -> list[int]:
 
 def literal(kernel: Kernel, wanted: list[int]) -> tuple[int, list[int]]:
     """Status and action in steps."""
-    x = [limited(q, -int(limit), int(limit)) for q, limit in zip(wanted, kernel.limit, strict=True)]
+    x = [limited(q, int(least), int(most)) for q, least, most in zip(wanted, kernel.least, kernel.most, strict=True)]
     return int(x != wanted), literal_network(kernel, x)
 
 
@@ -116,12 +118,12 @@ def test_the_fixed_point_entry_is_the_literal_arithmetic(sizes: tuple[int, ...],
 def test_inputs_round_half_away_from_zero(data: st.DataObject) -> None:
     """Around every step and half-step, and anywhere."""
     kernel = policies.kernel(ODD)
-    i = data.draw(st.integers(0, len(kernel.limit) - 1))
+    i = data.draw(st.integers(0, len(kernel.most) - 1))
     halves, nudge = data.draw(st.integers(-65534, 65534)), data.draw(st.integers(-300, 300))
     exact = data.draw(st.booleans())
     bits = bits_of(halves / 2 * float(kernel.lsb[i])) if exact else data.draw(st.integers(0, 2**32 - 1))
     bits = limited(bits + nudge, 0, 2**32 - 1)
-    row = [0] * len(kernel.limit)
+    row = [0] * len(kernel.most)
     row[i] = bits
     found, finite = reference.quantised(kernel, np.array([row], np.uint32).view(np.float32))
     wanted = literal_inputs(kernel, row)
@@ -152,13 +154,14 @@ def layered(rng: np.random.Generator, sizes: tuple[int, ...], activation: str = 
             rng.integers(1, 2**15, o),
             int(rng.integers(0, 16)),
         )
-        for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+        for i, o in pairwise(sizes)
     )
     inputs, outputs = sizes[0], sizes[-1]
     return Kernel(
         scale=rng.integers(2**15, 2**16, inputs),
         exponent=rng.integers(130, 160, inputs),
-        limit=rng.integers(1, INT16 + 1, inputs),
+        least=rng.integers(-INT16, 1, inputs),
+        most=rng.integers(0, INT16 + 1, inputs),
         layers=layers,
         activation=activation,
         act_lsb=np.full(outputs, 1e-3, np.float32),
@@ -185,11 +188,12 @@ def test_the_bound_is_attained_and_never_passed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kernel = layered(rng, (int(rng.integers(1, 40)), 8))
     (layer,) = kernel.layers
+    kernel = replace(kernel, least=-kernel.most)
     bound = accumulator_bound(kernel)
-    worst = [np.sign(w) * kernel.limit * (1 if b >= 0 else -1) for w, b in zip(layer.weight, layer.bias, strict=True)]
+    worst = [np.sign(w) * kernel.most * (1 if b >= 0 else -1) for w, b in zip(layer.weight, layer.bias, strict=True)]
     accumulated = np.array(worst) @ layer.weight.T + layer.bias
     assert np.abs(accumulated).max() == bound
-    anything = rng.integers(-kernel.limit, kernel.limit + 1, (200, len(kernel.limit)))
+    anything = rng.integers(kernel.least, kernel.most + 1, (200, len(kernel.most)))
     assert np.abs(anything @ layer.weight.T + layer.bias).max() <= bound
 
 
@@ -198,9 +202,7 @@ def test_the_bound_takes_later_layers_at_their_fullest() -> None:
     rng = np.random.default_rng(0)
     first, second = layered(rng, (2, 30, 4)).layers
     kernel = layered(rng, (2, 30, 4))
-    kernel = Kernel(
-        **{**vars(kernel), "layers": (Dense(0 * first.weight, 0 * first.bias, first.multiplier, 0), second)}
-    )
+    kernel = replace(kernel, layers=(Dense(0 * first.weight, 0 * first.bias, first.multiplier, 0), second))
     full = np.abs(second.weight).sum(axis=1) * INT16 + np.abs(second.bias)
     assert full.max() <= accumulator_bound(kernel) <= full.max() + 127 * 30
 
@@ -215,8 +217,8 @@ def test_a_possible_overflow_is_refused_from_2_to_the_31_on(over: int, refused: 
     before = Dense(np.zeros((400, 3), int), np.zeros(400, int), np.ones(400, int), 0)
     layers = (wide,) if at == 0 else (before, wide)
     kernel = layered(np.random.default_rng(0), (400 if at == 0 else 3, 1))
-    limit = np.full(len(kernel.limit), INT16)
-    kernel = Kernel(**{**vars(kernel), "layers": layers, "limit": limit})
+    full = np.full(len(kernel.most), INT16)
+    kernel = replace(kernel, layers=layers, least=-full, most=full)
     if refused:
         with pytest.raises(PossibleOverflow, match=f"layer {at}, output 0: the sum of products can reach 2,147,483,6"):
             accumulator_bound(kernel)
@@ -227,7 +229,7 @@ def test_a_possible_overflow_is_refused_from_2_to_the_31_on(over: int, refused: 
 def test_too_many_weights_are_refused() -> None:
     kernel = layered(np.random.default_rng(0), (1200, 2))
     with pytest.raises(PossibleOverflow, match="layer 0"):
-        accumulator_bound(Kernel(**{**vars(kernel), "limit": np.full(1200, INT16)}))
+        accumulator_bound(replace(kernel, least=np.full(1200, -INT16)))
 
 
 def test_products_are_summed_exactly() -> None:

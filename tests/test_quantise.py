@@ -94,8 +94,10 @@ def test_integers_are_close_on_flights_not_calibrated_on(activation: str) -> Non
 def test_ranges_cover_the_flights(sizes: tuple[int, ...], activation: str) -> None:
     """No observation that was met is clipped, and each has at least 9 bits of its range."""
     policy, kernel = policies.policy(sizes, activation), policies.kernel(sizes, activation)
-    assert (kernel.limit * kernel.lsb >= np.abs(policy.calibration).max(axis=0)).all()
-    assert ((kernel.limit >= 500) & (kernel.limit <= INT16)).all()
+    assert (kernel.most * kernel.lsb >= policy.calibration.max(axis=0)).all()
+    assert (kernel.least * kernel.lsb <= policy.calibration.min(axis=0)).all()
+    reach = np.maximum(-kernel.least, kernel.most)
+    assert ((reach >= 500) & (reach <= INT16)).all()
     assert not reference.step(kernel, policy.calibration)[0].any()
 
 
@@ -114,8 +116,8 @@ def test_integers_fit_their_types() -> None:
 
 def arrays(kernel: Kernel) -> list[np.ndarray]:
     layers = [x for layer in kernel.layers for x in (layer.weight, layer.bias, layer.multiplier, np.array(layer.shift))]
-    rest = [kernel.scale, kernel.exponent, kernel.limit, kernel.act_lsb, kernel.act_least, kernel.act_most]
-    return [*layers, *rest, kernel.act_safe]
+    rest = [kernel.scale, kernel.exponent, kernel.least, kernel.most, kernel.act_lsb]
+    return [*layers, *rest, kernel.act_least, kernel.act_most, kernel.act_safe]
 
 
 @pytest.mark.parametrize("sizes", [PENDULUM, ODD], ids=str)
@@ -130,9 +132,8 @@ def test_actions_stay_within_their_limits(sizes: tuple[int, ...], activation: st
     """Whatever is observed, and the limits are there in full."""
     policy, kernel = policies.policy(sizes, activation), policies.kernel(sizes, activation)
     rng = np.random.default_rng(0)
-    wild = (rng.choice([-1, 1], (4000, sizes[0])) * kernel.limit * kernel.lsb * rng.uniform(0, 2, (4000, 1))).astype(
-        np.float32
-    )
+    corners = np.where(rng.random((4000, sizes[0])) < 0.5, kernel.least, kernel.most) * kernel.lsb
+    wild = (corners * rng.uniform(0, 2, (4000, 1))).astype(np.float32)
     action = reference.step(kernel, wild)[1]
     low, high = policy.limits
     assert (action >= low - 0.5 * kernel.act_lsb).all()

@@ -36,11 +36,19 @@ def save(checkpoints: ocp.CheckpointManager, env_steps: int, state: Any) -> None
 def restore(checkpoints: ocp.CheckpointManager, env_steps: int, like: Any) -> Any:
     """The state saved at `env_steps`; `like` gives structure, shapes and types (one member's)."""
     try:
-        return checkpoints.restore(env_steps, args=ocp.args.StandardRestore(like))
+        state = checkpoints.restore(env_steps, args=ocp.args.StandardRestore(like))
     except (ValueError, KeyError) as error:
         raise OSError(
             f"{checkpoints.directory}: the checkpoint at step {env_steps:,} cannot be read ({_first(error)})"
         ) from None
+    # Orbax hands back whatever shapes it finds.
+    for (path, found), wanted in zip(jax.tree.leaves_with_path(state), jax.tree.leaves(like), strict=True):
+        if found.shape != wanted.shape:
+            raise OSError(
+                f"{checkpoints.directory}: the checkpoint at step {env_steps:,} is of another configuration than"
+                f" config.json ({jax.tree_util.keystr(path)} is {found.shape}, not {wanted.shape})"
+            )
+    return state
 
 
 def _first(error: Exception) -> str:

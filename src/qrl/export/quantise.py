@@ -60,7 +60,7 @@ def _quantised(policy: Policy, ridge: float) -> Kernel:
     floor, ceiling = policy.observation_offset - clip, policy.observation_offset + clip
     x_float = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
     envelope = np.abs(x_float).max(axis=0)
-    envelope = RANGE_MARGIN * np.maximum(envelope, LEAST_INPUT * max(envelope.max(), LEAST_INPUT))
+    envelope = RANGE_MARGIN * np.where(envelope > 0.0, envelope, LEAST_INPUT)
     scale, exponent = _as_scale(_steps(envelope, layers[0][0], LEAST_LEVELS))
     step = 2.0 ** (exponent - 142) / scale
     reach = np.minimum(np.floor(envelope / step), INT16)
