@@ -17,6 +17,20 @@ from qrl_envs import task as tasks
 ORIGIN = Origin("made-up", "hover", "reach a point and hover there", "0123456789ab", 3, 1_234_567)
 HOVER, PENDULUM, ODD, FLAT = (18, 64, 64, 4), (3, 64, 64, 1), (5, 7, 3, 2), (18, 4)
 
+# What an export holds, but for its report.
+EMITTED = {
+    "examples/bare_metal/CMakeLists.txt",
+    "examples/bare_metal/Makefile",
+    "examples/bare_metal/main.c",
+    "examples/qrl_policy/qrl_policy.ino",
+    "golden.csv",
+    "library.json",
+    "library.properties",
+    "manifest.json",
+    "qrl_policy.c",
+    "qrl_policy.h",
+}
+
 
 def hover_flights(rng: np.random.Generator, n: int) -> np.ndarray:
     """Observations [n, 18]: attitudes, positions, velocities and rates from a wild start to rest at the hover point."""

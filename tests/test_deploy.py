@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from brax.envs.fast import Fast
 
+import policies
 from frontdoor import TINY, complaint, qrl
 from qrl import deploy
 from qrl.export import targets
@@ -14,19 +15,7 @@ from qrl.export.kernel import PossibleOverflow
 from qrl.export.targets import ProofFailed
 
 LEAST = ("--starts", "8", "--vectors", "500")
-FILES = {
-    "examples/bare_metal/CMakeLists.txt",
-    "examples/bare_metal/Makefile",
-    "examples/bare_metal/main.c",
-    "examples/qrl_policy/qrl_policy.ino",
-    "golden.csv",
-    "library.json",
-    "library.properties",
-    "manifest.json",
-    "qrl_policy.c",
-    "qrl_policy.h",
-    "report.md",
-}
+FILES = policies.EMITTED | {"report.md"}
 
 
 @pytest.fixture(autouse=True)

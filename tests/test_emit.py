@@ -22,18 +22,6 @@ from qrl.policy import Policy
 
 HEADER, SOURCE = "qrl_policy.h", "qrl_policy.c"
 EXAMPLE = "examples/bare_metal"
-PATHS = {
-    "examples/bare_metal/CMakeLists.txt",
-    "examples/bare_metal/Makefile",
-    "examples/bare_metal/main.c",
-    "examples/qrl_policy/qrl_policy.ino",
-    "golden.csv",
-    "library.json",
-    "library.properties",
-    "manifest.json",
-    "qrl_policy.c",
-    "qrl_policy.h",
-}
 HOSTILE = {
     "ends the comment": 'a */ int x = *"/ ; /* b',
     "backslash for slash": "a *\\ int x; b",
@@ -80,7 +68,7 @@ def run(*command: str, cwd: Path) -> str:
 def test_nothing_is_left_to_fill_in(sizes: tuple[int, ...]) -> None:
     """Nor does a file say when or where it was made: the same policy gives the same files."""
     emitted = files(sizes)
-    assert set(emitted) == PATHS
+    assert set(emitted) == policies.EMITTED
     for name, text in emitted.items():
         assert not re.search(r"@\w+@", text), name
         assert not re.search(r"(^|[\s\"'(])/(home|tmp|work|root|usr)\b", text), name
@@ -299,7 +287,9 @@ def test_the_example_builds_and_runs(exported: Exported, tmp_path: Path) -> None
         wanted = reference.step(kernel, emit.golden(policy, kernel).obs[:1])[1][0]
         np.testing.assert_allclose([float(value) for value in values.split()], wanted, atol=6e-5)
         run("make", "-s", "clean", cwd=folder / EXAMPLE)
-        assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} <= PATHS | {"object.o"}
+        assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} <= policies.EMITTED | {
+            "object.o"
+        }
 
 
 def test_the_example_says_when_its_self_test_fails(exported: Exported, tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ import jax
 import numpy as np
 import pytest
 
+from frontdoor import complaint, qrl
 from qrl import loop, processes, results, sweep, sweep_command, sweep_plot, train
-from qrl.cli import main
 from qrl.grid import load
 from qrl.sweep import Group, Member, Result
 from qrl.train import Trainer, point, stack
@@ -45,23 +45,6 @@ def write_grid(folder: Path, axes: dict[str, Any], **more: Any) -> Path:
     path = folder / "grid.json"
     path.write_text(json.dumps({"task": "pendulum", "fixed": TINY, "axes": axes, "seeds": [0, 3], **more}))
     return path
-
-
-def qrl(*words: str | Path) -> int:
-    try:
-        return main([str(word) for word in words])
-    except SystemExit as stop:
-        return int(stop.code or 0)
-
-
-def complaint(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
-    """The one line on stderr of a command whose input is wrong."""
-    capsys.readouterr()
-    assert qrl(*words) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("qrl: ")
-    assert error.count("\n") == 1
-    return error
 
 
 def rows_of(path: Path) -> Rows:

@@ -106,7 +106,9 @@ def test_counts_may_be_written_with_an_exponent(path: Path) -> None:
 def test_a_flat_plate_is_a_body(path: Path) -> None:
     """Where one moment is the sum of the other two, however the sum rounds."""
     for x, y, z in [(0.1, 0.2, 0.3), (0.0001, 0.0003, 0.0004), (0.0022, 0.0001, 0.0021)]:
-        load(path, hover(f'"vehicle": {{"inertia_kg_m2": [{x}, {y}, {z}]}}'))
+        plate = load(path, hover(f'"vehicle": {{"inertia_kg_m2": [{x}, {y}, {z}]}}'))
+        assert isinstance(plate, task.QuadrotorTask)
+        assert plate.vehicle.inertia_kg_m2 == (x, y, z)
 
 
 # What is wrong -> the file, and the words that its one line must hold.
