@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
-from qrl import checkpoint, loop, runs
+from qrl import checkpoint, laps, loop, restore, runs
 from qrl.config import Config
 from qrl.runs import RunConfig, TaskRecord
 from qrl_envs import env as worlds
@@ -32,7 +32,7 @@ SMALL = {
 
 @pytest.fixture(autouse=True)
 def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "CHUNK_SECONDS", 1e-4)  # pause after every unroll or two
+    monkeypatch.setattr(laps, "CHUNK_SECONDS", 1e-4)  # pause after every unroll or two
 
 
 def run_config(seed: int = 0, seeds: int = 1, **changes: object) -> RunConfig:
@@ -51,7 +51,9 @@ def train(
     seen: list[loop.Event] = []
 
     def stopped() -> bool:
-        return stop_after is not None and sum(not isinstance(e, loop.Compiling) for e in seen) >= stop_after
+        return (
+            stop_after is not None and sum(not isinstance(e, loop.Compiling | loop.GoingOn) for e in seen) >= stop_after
+        )
 
     for event in loop.train(env, run, out, resume=resume, stopped=stopped):
         seen.append(event)
@@ -68,7 +70,7 @@ def metrics(folder: Path) -> list[dict[str, str]]:
 
 
 def last_state(folder: Path, run: RunConfig, env: Env) -> list[np.ndarray]:
-    _, state, _ = loop.restore(env, run, folder)
+    _, state, _ = restore.last(env, run, folder)
     return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
 
 
@@ -110,8 +112,7 @@ def test_resumed_run_equals_one_never_stopped(tmp_path: Path, pendulum: Env, who
 def test_rows_after_the_checkpoint_are_cut(tmp_path: Path, pendulum: Env, whole: Path) -> None:
     """Killed before the last checkpoint was made: its row is made again, once, and the run then ends."""
     train(tmp_path, run_config(), pendulum)
-    with checkpoint.manager(tmp_path) as saved:
-        saved.delete(1200)
+    checkpoint.clear_after(tmp_path, 1000)
     train(tmp_path, run_config(), pendulum, resume=True)
     assert metrics(tmp_path) == metrics(whole)
 
@@ -172,7 +173,7 @@ def test_row_without_its_checkpoint_is_cut_and_made_again(tmp_path: Path, pendul
 
 def test_no_checkpoint_is_said(tmp_path: Path, pendulum: Env) -> None:
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
-        loop.restore(pendulum, run_config(), tmp_path)
+        restore.last(pendulum, run_config(), tmp_path)
 
 
 def test_stop_before_the_first_step_saves_nothing(tmp_path: Path, pendulum: Env) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from frontdoor import complaint, qrl
-from qrl import loop, processes, results, sweep, sweep_command, sweep_plot, train
+from qrl import laps, processes, results, sweep, sweep_command, sweep_plot, train
 from qrl.grid import load
 from qrl.sweep import Group, Member, Result
 from qrl.train import Trainer, point, stack
@@ -209,7 +209,7 @@ def test_a_chunk_is_recorded_whole_or_not_at_all(tmp_path: Path, laps: int, reco
     asked, chunks = iter(range(100)), tmp_path / "chunks"
     chunks.mkdir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loop, "CHUNK_SECONDS", 1e-9)  # a lap is one unroll
+        patch.setattr("qrl.laps.CHUNK_SECONDS", 1e-9)  # a lap is one unroll
         events = list(sweep._chunk(group, programs, group.members, 2, device, chunks, lambda: next(asked) >= laps))
     assert len(events) == laps + (recorded > 0)
     assert len(sweep.finished(chunks)) == recorded
@@ -253,10 +253,9 @@ def test_a_chunk_that_cannot_be_read_is_made_anew(
 
 def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid, out = write_grid(tmp_path, {"gamma": [0.9]}), tmp_path / "out"
-    with sweep_command._locked(out, processes.Process(0, 1, "")):
+    out.mkdir()
+    with processes.locked(out / "process-0.lock", ""):
         assert "another sweep is at work in" in complaint(capsys, "sweep", grid, "--out", out)
-        with sweep_command._locked(out, processes.Process(1, 2, "")):  # one of several
-            pass
     assert not (out / "grid.json").exists()
 
 
@@ -333,8 +332,8 @@ def test_the_estimate_of_a_chunk_covers_what_xla_needs(tmp_path: Path, members: 
     env, config = worlds.make("pendulum"), grid.points[0].learner
     trainer, here = Trainer(env, config), point(env, config)
     points = stack([here] * members)
-    states = jax.eval_shape(trainer.init, loop.seeds(0, members), points)
-    used: Any = loop.compile_advance(trainer, states, points).memory_analysis()
+    states = jax.eval_shape(trainer.init, laps.seeds(0, members), points)
+    used: Any = laps.compile_advance(trainer, states, points).memory_analysis()
     need = used.argument_size_in_bytes + used.output_size_in_bytes + used.temp_size_in_bytes - used.alias_size_in_bytes
     estimate = (members + 1) * sweep.member_bytes(trainer, here)
     assert estimate / 4 <= need <= estimate
@@ -352,7 +351,7 @@ def test_vmapped_members_agree_with_members_in_turn(tmp_path: Path, monkeypatch:
     def last(in_turn: bool) -> train.TrainState:
         monkeypatch.setattr(train, "_in_turn", lambda: in_turn)
         trainer = Trainer(worlds.make("pendulum"), config)
-        return trainer.advance(trainer.init(loop.seeds(0, 4), points), points, np.int32(config.unrolls))
+        return trainer.advance(trainer.init(laps.seeds(0, 4), points), points, np.int32(config.unrolls))
 
     in_turn, at_once = last(in_turn=True), last(in_turn=False)
     assert int(in_turn.learner.updates[0]) == 9

@@ -31,14 +31,22 @@ def add(ring: Ring, unroll: chex.ArrayTree) -> Ring:
     return Ring(data, ring.inserted + 1)
 
 
-def draw(ring: Ring, key: chex.PRNGKey, shape: tuple[int, ...]) -> chex.Array:
-    """Indices of trajectories (slot, lane), uniform with replacement over the filled slots; int32 [*shape].
+def draw(ring: Ring, keys: chex.PRNGKey, minibatches: int, each: int) -> chex.Array:
+    """Indices of trajectories (slot, lane); int32 [minibatches, S·each] for `keys` [S].
 
-    The ring must hold at least one unroll. Drawn for many minibatches at once: a draw costs far more to
-    compile, and more to run, than the gather.
+    The ring's lanes are S shards of neighbours. Each puts `each` trajectories of its own into every minibatch, drawn
+    by its own key, uniformly with replacement over the filled slots: so a shard's share is the same whatever other
+    shards are in the ring with it. The ring must hold at least one unroll. Drawn for many minibatches at once: a draw
+    costs far more to compile, and more to run, than the gather.
     """
     slots, lanes = jax.tree.leaves(ring.data)[0].shape[:2]
-    return jax.random.randint(key, shape, 0, jnp.minimum(ring.inserted, slots) * lanes)
+    shards = keys.shape[0]
+    width = lanes // shards
+    filled = jnp.minimum(ring.inserted, slots)
+    drawn = jax.vmap(lambda key: jax.random.randint(key, (minibatches, each), 0, filled * width))(keys)
+    first = jnp.arange(shards, dtype=jnp.int32)[:, None, None] * width
+    index = drawn // width * lanes + first + drawn % width
+    return jnp.swapaxes(index, 0, 1).reshape(minibatches, -1)
 
 
 def gather(ring: Ring, index: chex.Array) -> chex.ArrayTree:

@@ -1,54 +1,245 @@
-"""Orbax checkpoints of the whole training state, one manager for each member's folder."""
+"""Checkpoints of the whole training state of one run folder, written beside the training by Orbax.
 
+A checkpoint is whole once it has a seal: a file, written last, with the SHA-256 of every other file. Whoever reads
+checks the seal first, so that nothing damaged ever reaches Orbax; what has no seal was being written when the process
+was killed, and counts for nothing.
+"""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint import checkpoint_managers as policies
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-KEEP = 5
+from qrl.runs import Row, replace_text
 
-
-def manager(folder: Path) -> ocp.CheckpointManager:
-    """The checkpoints of a run folder; a half-written one is not among them."""
-    return ocp.CheckpointManager(
-        (folder / "checkpoints").resolve(),
-        options=ocp.CheckpointManagerOptions(max_to_keep=KEEP, enable_async_checkpointing=False),
-    )
-
-
-def member(states: Any, index: int) -> Any:
-    """One member's state as NumPy copies: a live view of a device array would silently cancel its donation."""
-    return jax.tree.map(lambda x: np.array(x[index]), states)
+KEEP = 5  # the last so many, and the best
+FORMAT: Literal[1] = 1
+SEAL = "seal.json"
+STATE = "state"
+# Whoever calls Orbax does so alone: it must not wait for other processes of the run.
+_ONE_PROCESS = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0}, barrier_sync_key_prefix="qrl")
 
 
-def save(checkpoints: ocp.CheckpointManager, env_steps: int, state: Any) -> None:
-    """Save one member's state; OSError, naming the folder, if it did not come about."""
+class Record(BaseModel):
+    """What a checkpoint holds besides the training state."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
+
+    rows: list[Row]  # of metrics.csv, up to here
+    train_seconds: float
+    report_seconds: float  # of these, since the last report
+
+
+class _Seal(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
+
+    format: Literal[1] = FORMAT
+    record: Record
+    sha256: dict[str, str]  # of each file, by its path in the checkpoint
+    record_sha256: str
+
+
+class Damaged(OSError):
+    """A checkpoint is not what was written; the message says which file of which."""
+
+
+class Foreign(OSError):
+    """A checkpoint is whole, and not one of this configuration or version."""
+
+
+class Checkpoint(NamedTuple):
+    env_steps: int
+    state: Any  # one member's, in NumPy
+    record: Record
+
+
+def steps(folder: Path) -> list[int]:
+    """The environment steps at which a run folder has sealed checkpoints, newest first."""
+    return sorted(int(path.parent.name) for path in _root(folder).glob(f"*/{SEAL}") if _is_step(path.parent))[::-1]
+
+
+def read(folder: Path, env_steps: int, like: Any) -> Checkpoint:
+    """The checkpoint at `env_steps`; `like` gives structure, shapes and types of a member's state.
+
+    Raises Damaged where the files are not those that were sealed, Foreign where they hold something else than `like`.
+    """
+    path = _root(folder) / str(env_steps)
+    record = _checked(path)
+    wanted = _by_name(like)
     try:
-        saved = checkpoints.save(env_steps, args=ocp.args.StandardSave(state))
-    except ValueError as error:  # how Orbax reports a full disk
-        raise OSError(f"{checkpoints.directory}: the checkpoint could not be written ({_first(error)})") from None
-    if not saved:
-        raise OSError(f"{checkpoints.directory}: the checkpoint at step {env_steps:,} was not written")
-
-
-def restore(checkpoints: ocp.CheckpointManager, env_steps: int, like: Any) -> Any:
-    """The state saved at `env_steps`; `like` gives structure, shapes and types (one member's)."""
-    try:
-        state = checkpoints.restore(env_steps, args=ocp.args.StandardRestore(like))
-    except (ValueError, KeyError) as error:
-        raise OSError(
-            f"{checkpoints.directory}: the checkpoint at step {env_steps:,} cannot be read ({_first(error)})"
-        ) from None
-    # Orbax hands back whatever shapes it finds.
-    for (path, found), wanted in zip(jax.tree.leaves_with_path(state), jax.tree.leaves(like), strict=True):
-        if found.shape != wanted.shape:
-            raise OSError(
-                f"{checkpoints.directory}: the checkpoint at step {env_steps:,} is of another configuration than"
-                f" config.json ({jax.tree_util.keystr(path)} is {found.shape}, not {wanted.shape})"
+        with ocp.StandardCheckpointer(multiprocessing_options=_ONE_PROCESS) as orbax:
+            found = orbax.restore(path / STATE, wanted)
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise Foreign(f"{path}: of another version or configuration ({_first(error)})") from None
+    for name, leaf in wanted.items():  # Orbax hands back whatever it finds
+        if (found[name].shape, found[name].dtype) != (leaf.shape, leaf.dtype):
+            raise Foreign(
+                f"{path}: of another configuration than config.json ({name} is {found[name].dtype}"
+                f"{list(found[name].shape)}, not {leaf.dtype}{list(leaf.shape)})"
             )
-    return state
+    state = jax.tree.unflatten(jax.tree.structure(like), [np.asarray(found[name]) for name in wanted])
+    return Checkpoint(env_steps, state, record)
+
+
+def _by_name(tree: Any) -> dict[str, Any]:
+    """The leaves of a state by their paths in it."""
+    return {jax.tree_util.keystr(path, simple=True, separator="."): x for path, x in jax.tree.leaves_with_path(tree)}
+
+
+def _checked(path: Path) -> Record:
+    """The record of a checkpoint whose every file is as it was sealed."""
+    try:
+        text = (path / SEAL).read_bytes()
+        version = json.loads(text)
+    except (OSError, ValueError, RecursionError) as error:
+        raise Damaged(f"{path}/{SEAL}: cannot be read ({_first(error)})") from None
+    if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found > FORMAT:
+        raise Foreign(f"{path}: of a later version of qrl (format {found}; this one reads {FORMAT})")
+    try:
+        seal = _Seal.model_validate_json(text)
+    except ValidationError as error:
+        raise Damaged(f"{path}/{SEAL}: is damaged ({error.errors()[0]['msg']})") from None
+    if _record_sha256(seal.record) != seal.record_sha256:
+        raise Damaged(f"{path}/{SEAL}: is damaged")
+    found = set(_files(path))
+    for name, digest in seal.sha256.items():
+        if name not in found:
+            raise Damaged(f"{path}/{name}: is missing")
+        try:
+            same = _sha256(path / name) == digest
+        except OSError as error:
+            raise Damaged(f"{path}/{name}: cannot be read ({_first(error)})") from None
+        if not same:
+            raise Damaged(f"{path}/{name}: is damaged")
+    return seal.record
+
+
+def clear_after(folder: Path, env_steps: int) -> None:
+    """Leave no checkpoint after `env_steps`: what is sealed goes if it is whole, and anything else is set aside."""
+    for path in sorted(_root(folder).glob("*")):
+        if not _is_step(path) or int(path.name) <= env_steps:
+            continue
+        with suppress(Damaged, Foreign):
+            _checked(path)
+            (path / SEAL).unlink()  # first: killed half-way, what is left is no checkpoint
+            shutil.rmtree(path)
+            continue
+        aside = path.with_name(f"aside-{path.name}")
+        shutil.rmtree(aside, ignore_errors=True)
+        path.rename(aside)
+
+
+class Writer:
+    """Saves checkpoints of one run folder, one at a time, while the training goes on."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._rows: list[Row] = []
+        self._thread = ThreadPoolExecutor(1, "checkpoint")
+        self._pending: Future[None] | None = None
+        _root(folder).mkdir(exist_ok=True)
+        self._orbax = ocp.CheckpointManager(
+            _root(folder).resolve(),
+            options=ocp.CheckpointManagerOptions(
+                create=False,
+                enable_async_checkpointing=False,
+                preservation_policy=_Preserve(self._best),
+                multiprocessing_options=_ONE_PROCESS,
+            ),
+        )
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Begin to save; OSError if the save before did not come about."""
+        self.wait()
+        self._pending = self._thread.submit(self._save, checkpoint)
+
+    def check(self) -> None:
+        """OSError if the last save has failed already."""
+        if self._pending and self._pending.done():
+            self.wait()
+
+    def wait(self) -> None:
+        """Until what was begun is on disk; OSError, naming the folder, if it did not get there."""
+        pending, self._pending = self._pending, None
+        if pending:
+            pending.result()
+
+    def close(self) -> None:
+        """Give up threads; what is still being written is finished, and no longer complained about."""
+        self._thread.shutdown()
+        with suppress(OSError, ValueError):
+            self._orbax.close()
+
+    def _save(self, checkpoint: Checkpoint) -> None:
+        if not self._folder.is_dir():  # Orbax would make it anew
+            raise OSError(f"{self._folder}: the run folder is gone")
+        self._rows = checkpoint.record.rows
+        path = _root(self._folder) / str(checkpoint.env_steps)
+        try:
+            # In NumPy once more: Brax's counters turn their parts into device arrays whenever they are put together.
+            state = {name: np.asarray(leaf) for name, leaf in _by_name(checkpoint.state).items()}
+            self._orbax.save(
+                checkpoint.env_steps,
+                args=ocp.args.Composite(**{STATE: ocp.args.StandardSave(state)}),
+                force=True,
+            )
+            seal = _Seal(
+                record=checkpoint.record,
+                sha256={name: _sha256(path / name) for name in _files(path)},
+                record_sha256=_record_sha256(checkpoint.record),
+            )
+            replace_text(path / SEAL, seal.model_dump_json() + "\n")
+        except (OSError, ValueError) as error:  # ValueError: how Orbax reports a full disk
+            raise OSError(f"{path}: the checkpoint could not be written ({_first(error)})") from None
+
+    def _best(self, among: Sequence[int]) -> int:
+        """Of these steps the one whose report was best; the first, where none had a report."""
+        reports = {row["env_steps"]: row for row in self._rows}
+        ranks = {step: (max(row["success"], 0.0), row["return_mean"]) for step in among if (row := reports.get(step))}
+        return max(ranks, key=lambda step: ranks[step], default=among[0])
+
+
+class _Preserve(policies.PreservationPolicy):
+    """The last KEEP, and the best."""
+
+    def __init__(self, best: Any) -> None:
+        self._best = best
+
+    def should_preserve(self, checkpoints: Sequence[Any], *, context: Any) -> Sequence[bool]:
+        there = [info.step for info in checkpoints]
+        kept = {*there[-KEEP:], self._best(there)}
+        return [step in kept for step in there]
+
+
+def _root(folder: Path) -> Path:
+    return folder / "checkpoints"
+
+
+def _is_step(path: Path) -> bool:
+    return path.name.isdecimal() and path.is_dir()
+
+
+def _files(path: Path) -> list[str]:
+    return sorted(str(f.relative_to(path)) for f in path.rglob("*") if f.is_file() and f.name != SEAL)
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _record_sha256(record: Record) -> str:
+    return hashlib.sha256(record.model_dump_json().encode()).hexdigest()
 
 
 def _first(error: Exception) -> str:

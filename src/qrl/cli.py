@@ -98,10 +98,11 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     sweep.add_argument(
         "--memory-gb", type=positive, help="what the members may take (half of the devices' memory)", metavar="GB"
     )
-    hosts = sweep.add_argument_group("several processes", "each told these, or by JAX's or SLURM's variables")
-    hosts.add_argument("--process-id", type=whole_number, help="which this is, from 0", metavar="I")
-    hosts.add_argument("--processes", type=count, help="how many there are", metavar="N")
-    hosts.add_argument("--coordinator", help="where process 0 can be reached", metavar="HOST:PORT")
+    for command, what in ((train, "that train together"), (sweep, "that share the sweep")):
+        hosts = command.add_argument_group(f"processes {what}", "each told these, or by JAX's or SLURM's variables")
+        hosts.add_argument("--process-id", type=whole_number, help="which this is, from 0", metavar="I")
+        hosts.add_argument("--processes", type=count, help="how many there are", metavar="N")
+        hosts.add_argument("--coordinator", help="where process 0 can be reached", metavar="HOST:PORT")
 
     commands.add_parser("tasks", help="list the tasks that can be trained", allow_abbrev=False)
     args, unknown = parser.parse_known_args(argv)

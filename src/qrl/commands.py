@@ -2,18 +2,21 @@
 
 import argparse
 import json
+import os
 import shlex
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn
 
-from qrl import deploy, loop, plots, request, runs, sweep_command
+from qrl import deploy, loop, peers, plots, processes, request, restore, runs, sweep_command
+from qrl.checkpoint import Foreign
 from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
@@ -41,21 +44,25 @@ def run(args: argparse.Namespace) -> int:
             "tasks": list_tasks,
         }
         return commands[args.command](args)
-    except BadInput as error:
+    except (BadInput, Foreign) as error:
         complain(str(error))
         return WRONG_INPUT
     except (loop.NotFinite, PossibleOverflow, ProofFailed) as error:
         complain(str(error))
-        return FAILED
     except OSError as error:
         complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
-        return FAILED
     except jax.errors.JaxRuntimeError as error:  # out of memory, above all
         complain(str(error))
-        return FAILED
+    except ValueError as error:
+        if not jax.distributed.is_initialized():
+            raise
+        complain(f"another process of the run is gone: {error}")  # how JAX says it
     except KeyboardInterrupt:
         complain("interrupted")
-        return FAILED
+    if jax.distributed.is_initialized():  # Python's own end would wait for the others, and they for this process
+        sys.stdout.flush()
+        os._exit(FAILED)
+    return FAILED
 
 
 def list_tasks(_: argparse.Namespace) -> int:
@@ -71,6 +78,31 @@ def list_tasks(_: argparse.Namespace) -> int:
 
 def train(args: argparse.Namespace) -> int:
     begun = time.perf_counter()
+    process = processes.this_process(args.process_id, args.processes, args.coordinator, os.environ)
+    console.quiet = process.number != peers.FIRST
+    processes.join(process)
+    with ExitStack() as until_done:
+        try:
+            plan = _plan(args, until_done) if peers.first() else None
+        except BaseException:
+            peers.firsts(np.bool_(False))  # the others wait to hear
+            peers.firsts_text("")
+            raise
+        held = bool(peers.firsts(np.bool_(plan is not None and plan.held)))
+        config = peers.firsts_text(plan.config.model_dump_json() if plan else "")
+        if not config:
+            return DONE
+        return _train(RunConfig.model_validate_json(config), plan.out if plan else Path(), held, args, begun)
+
+
+class _Plan(NamedTuple):
+    config: RunConfig
+    out: Path
+    held: bool  # the folder holds this run already
+
+
+def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
+    """What is to be trained, and where, the folder ours `until_done`; None: nothing is left to do."""
     flags = _flags(args)
     file = request.config_file(args.config)
     config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds)
@@ -85,19 +117,31 @@ def train(args: argparse.Namespace) -> int:
         config = request.resumed(out, config, file.learner | flags, seed, args.seeds or file.seeds)
         if loop.finished(out, config):
             console.print(f"{out}: finished already; nothing to do")
-            return DONE
+            return None
+        if changed := request.other_versions(config.versions):
+            console.print(f"other versions than it began with, so the bits may differ: {changed}")
     env = request.environment(config.task)
     request.check(env, config.learner)
+    request.check_devices(config)
+    out.mkdir(parents=True, exist_ok=True)
+    until_done.enter_context(processes.locked(out / "lock", f"{out}: another process is at work in it"))
     _prepare(out, config, held)
+    return _Plan(config, out, held)
+
+
+def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, begun: float) -> int:
     seeds = f"seed {config.seed}" if config.seeds == 1 else f"{config.seeds} seeds from {config.seed}"
-    console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {config.devices[0]} -> {out}")
+    devices = request.devices(config)
+    console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {devices} -> {out}")
+    env = request.environment(config.task)
     with stop_requested() as stopped:
         flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
-        if flights is None:
-            what = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
-            console.print(f"stopped and saved; to go on: make train {what} OUT={shlex.quote(str(out))} RESUME=1")
-            return FAILED
-    _finish(out, config, flights, time.perf_counter() - begun)
+    if flights is None:
+        what = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
+        console.print(f"stopped and saved; to go on: make train {what} OUT={shlex.quote(str(out))} RESUME=1")
+        return FAILED
+    if peers.first():
+        _finish(out, config, flights, time.perf_counter() - begun)
     return DONE
 
 
@@ -140,6 +184,10 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
             if isinstance(event, loop.Compiling):
                 compiling = event.what
                 console.print(f"compiling {event.what} ({time.perf_counter() - started:.1f} s)")
+            elif isinstance(event, loop.GoingOn):
+                for note in event.notes:
+                    complain(f"warning: {note}")
+                console.print(f"going on from step {event.env_steps:,}")
             elif isinstance(event, loop.Progress):
                 note = f"{event.steps_per_second:,.0f} steps/s, {clock(event.seconds_left)} left"
                 bar.update(task, completed=event.env_steps, note=note)
@@ -211,7 +259,7 @@ def evaluate(args: argparse.Namespace) -> int:
     table: list[dict[str, Any]] = []
     for i, folder in enumerate(runs.members(args.run, config)):
         try:
-            trainer, state, env_steps = loop.restore(env, config, folder)
+            trainer, state, env_steps = restore.last(env, config, folder)
         except FileNotFoundError as error:
             raise BadInput(str(error)) from None
         flights = jax.tree.map(lambda x: x[0], trainer.fly(state.learner, stack([point(env, config.learner)]), starts))

@@ -5,6 +5,7 @@ differ in them alone share one program; static ones (shapes, counts, choices, wh
 shape the program.
 """
 
+import math
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -44,6 +45,10 @@ class Config(BaseModel):
     warmup_unrolls: Static[Count] = Field(description="unrolls collected before learning starts")
     updates_per_unroll: Static[Count] = Field(description="minibatch updates after each unroll")
     minibatch_lanes: Static[Count] = Field(description="trajectories (slot, lane) of one minibatch")
+    shards: Static[Count | None] = Field(
+        description="equal shares of lanes and minibatch: devices must divide them, and results are the same on any"
+        " number that does; null: 8, or as many as lanes and minibatch_lanes allow"
+    )
 
     policy_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the policy")
     critic_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the critic")
@@ -89,7 +94,14 @@ class Config(BaseModel):
                 f"expected steps of at least warmup_unrolls · lanes · unroll_steps"
                 f" = {self.warmup_unrolls * self.unroll_size:,}, found {self.steps:,}"
             )
+        for name in ("lanes", "minibatch_lanes"):
+            if (value := getattr(self, name)) % self.logical_shards:
+                raise ValueError(f"expected {name} to be a multiple of shards = {self.shards}, found {value}")
         return self
+
+    @property
+    def logical_shards(self) -> int:
+        return self.shards or math.gcd(8, self.lanes, self.minibatch_lanes)
 
     @property
     def traced(self) -> dict[str, Any]:

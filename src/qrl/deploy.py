@@ -15,7 +15,7 @@ import numpy as np
 from brax.envs.base import Env, State
 from numpy.typing import NDArray
 
-from qrl import evaluate, loop, request, runs
+from qrl import evaluate, request, restore, runs
 from qrl.evaluate import Flights, summarise
 from qrl.export import baseline, emit
 from qrl.export import kernel as integer
@@ -51,7 +51,7 @@ class Run:
             raise BadInput(f"{folder}: holds {self.config.seeds} seeds; name one of them, such as RUN={one}")
         self.env: Env = request.environment(self.config.task)
         try:
-            self.trainer, self.state, self.env_steps = loop.restore(self.env, self.config, folder)
+            self.trainer, self.state, self.env_steps = restore.last(self.env, self.config, folder)
         except OSError as error:
             raise BadInput(str(error)) from None
         spec = self.config.task.spec

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from brax.training.acme import running_statistics as statistics
+from jax.flatten_util import ravel_pytree
 
 from qrl.config import Config
 from qrl.networks import MLP, log_density
@@ -48,10 +49,15 @@ def hyper(config: Config) -> Hyper:
 
 
 class Learner:
-    """The learner's pure functions for one environment's sizes and one configuration; holds no state."""
+    """The learner's pure functions for one environment's sizes and one configuration; holds no state.
 
-    def __init__(self, config: Config, observation_size: int, action_size: int) -> None:
+    Where a minibatch is spread over devices, `axis` names the mesh axis: `update` and `observe` then take a device's
+    part, and give every device the same.
+    """
+
+    def __init__(self, config: Config, observation_size: int, action_size: int, axis: str | None = None) -> None:
         self.config = config
+        self.axis = axis
         self.observation_size = observation_size
         self.policy = MLP(config.policy_hidden, action_size, config.activation, final_gain=0.01)
         self.critic = MLP(config.critic_hidden, 1, config.activation, final_gain=1.0)
@@ -115,12 +121,14 @@ class Learner:
         if not self.config.normalise_observations:
             return state
         return state._replace(
-            statistics=statistics.update(state.statistics, observation.reshape(-1, self.observation_size))
+            statistics=statistics.update(
+                state.statistics, observation.reshape(-1, self.observation_size), pmap_axis_name=self.axis
+            )
         )
 
     def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
         """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""
-        gradient, terms = jax.grad(self._loss, has_aux=True)(state.params, state, batch)
+        gradient, terms = self._over_devices(jax.grad(self._loss, has_aux=True)(state.params, state, batch))
         start, end = self.hyper["learning_rate"], self.hyper["learning_rate_end"]
         rate = start + self.progress(state) * (end - start)
 
@@ -170,8 +178,9 @@ class Learner:
             rho,
         )
         a_trace = trace.a_trace
+        deviation = jnp.sqrt(self._over_devices(jnp.mean(a_trace**2)))
         if config.normalise_advantage:
-            a_trace = a_trace / (jnp.sqrt(jnp.mean(a_trace**2)) + 1e-8)
+            a_trace = a_trace / (deviation + 1e-8)
         margins = {"epsilon": hyper["epsilon"], "xi": hyper.get("xi")}
         policy_loss = -jnp.mean(perceptron(log_pi, batch.log_mu, a_trace, form=config.form, **margins))
         value_loss = jnp.mean((value - trace.v_trace) ** 2)
@@ -179,12 +188,19 @@ class Learner:
         return policy_loss + value_loss, Terms(
             log_rho=jnp.mean(log_rho),
             value=jnp.mean(value),
-            a_trace=jnp.sqrt(jnp.mean(trace.a_trace**2)),
+            a_trace=deviation,
             policy_loss=policy_loss,
             value_loss=value_loss,
             policy_gradient=zero,
             value_gradient=zero,
         )
+
+    def _over_devices(self, part: chex.ArrayTree) -> Any:
+        """Means over the devices, in one exchange."""
+        if self.axis is None:
+            return part
+        flat, whole = ravel_pytree(part)
+        return whole(jax.lax.pmean(flat, self.axis))
 
     def _averaging(self, state: LearnerState) -> chex.Array:
         """Updates since averaging began; ≤ 0 before."""

@@ -1,7 +1,10 @@
-"""What a sweep runs on: the devices, every core of a CPU, and the other processes of the same command."""
+"""What a command runs on: devices, every core of a CPU, the other processes of the command, and those of others."""
 
+import fcntl
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +30,7 @@ def this_process(index: int | None, count: int | None, coordinator: str | None, 
     ]
     index, count = (_number(flag, next((v for v in values if v is not None), None)) for flag, *values in found)
     if coordinator and count is None and index is None:
-        raise BadInput("--processes is missing: expected how many share the sweep, where there is a --coordinator")
+        raise BadInput("--processes is missing: expected how many there are, where there is a --coordinator")
     coordinator = coordinator or env.get("JAX_COORDINATOR_ADDRESS") or ""
     if count is None and index is None:
         return Process(0, 1, "")
@@ -52,6 +55,19 @@ def join(process: Process) -> None:
             jax.distributed.initialize(process.coordinator or None, process.of, process.number)
         except (RuntimeError, ValueError) as error:
             raise OSError(f"process {process.number} of {process.of} cannot meet the others: {error}") from None
+
+
+@contextmanager
+def locked(path: Path, busy: str) -> Iterator[None]:
+    """Hold the lock file at `path`; BadInput, saying `busy`, if another process does. It goes when its process does."""
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BadInput(busy) from None
+        except OSError:
+            pass  # a file system without locks
+        yield
 
 
 def workers() -> list[Any]:

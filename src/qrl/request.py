@@ -10,6 +10,7 @@ from brax.envs.base import Env
 from qrl import runs
 from qrl.config import Config
 from qrl.runs import ConfigFile, RunConfig, TaskRecord
+from qrl.train import spread
 from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as tasks
@@ -113,6 +114,31 @@ def check(env: Env, learner: Config) -> None:
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
     except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
         raise BadInput(f"this environment does not work with jax {jax.__version__}: {error}") from None
+
+
+def devices(run: RunConfig) -> str:
+    """What a run trains on here, in words."""
+    mesh = spread(jax.devices(), run.seeds, run.learner.logical_shards)
+    count, there = mesh.size if mesh else 1, jax.device_count()
+    of = f" of {there}" if count < there else ""
+    return f"{count}{of} {jax.default_backend()} device{'s' * (count > 1 or bool(of))}"
+
+
+def check_devices(run: RunConfig) -> None:
+    """Whether every one of several processes has a part in the run."""
+    mesh = spread(jax.devices(), run.seeds, run.learner.logical_shards)
+    if jax.process_count() > 1 and (mesh.size if mesh else 1) < jax.device_count():
+        raise BadInput(
+            f"key 'shards': expected shares that the processes' {jax.device_count()} devices can divide among them,"
+            f" found {run.learner.logical_shards}"
+        )
+
+
+def other_versions(began: dict[str, str]) -> str:
+    """Which packages are of another version than those that a run began with."""
+    now = runs.versions()
+    changed = [name for name in sorted(began.keys() | now.keys()) if began.get(name) != now.get(name)]
+    return ", ".join(f"{name} {began.get(name, 'none')}, now {now.get(name, 'none')}" for name in changed)
 
 
 def stored(folder: Path) -> RunConfig:

@@ -17,13 +17,19 @@ from qrl.types import Transition
 
 
 class Lanes(NamedTuple):
-    """The environments between unrolls; leading axis N everywhere."""
+    """The environments between unrolls; leading axis N everywhere.
 
+    Whatever is drawn for a lane follows from keys that all lanes share, the lane's number and its count of starts: so
+    it does not matter which lanes are stepped side by side, or on which device.
+    """
+
+    number: chex.Array  # [N] int32 among all lanes of the run
     state: State
     steps: chex.Array  # [N] int32 into the episode
     ended: chex.Array  # [N] bool: the episode is over; the lane restarts before its next step
     fresh: State  # [N] each lane's next start
-    used: chex.Array  # [N] bool: that start has been taken
+    start: chex.Array  # [N] int32: which of its starts that is
+    used: chex.Array  # [N] bool: it has been taken
     early: chex.Array  # [N] int32: episodes that ended before their last step, ever
 
 
@@ -32,38 +38,48 @@ def episode_steps(env: Env, configured: int | None) -> int:
     return configured or getattr(env, "episode_steps", 1000)
 
 
-def begin(env: Env, key: chex.PRNGKey, lanes: int, longest: int, unroll_steps: int) -> Lanes:
-    """N lanes at fresh starts, staggered by whole unrolls so that their episodes do not end together."""
-    state = jax.vmap(env.reset)(jax.random.split(key, lanes))
-    steps = jnp.arange(lanes) * longest // lanes // unroll_steps * unroll_steps
-    none = jnp.zeros(lanes, bool)
-    return Lanes(state, steps.astype(jnp.int32), none, state, ~none, jnp.zeros(lanes, jnp.int32))
+def begin(env: Env, key: chex.PRNGKey, number: chex.Array, lanes: int, longest: int, unroll_steps: int) -> Lanes:
+    """Those of a run's `lanes` whose numbers are in `number` [N], at their first starts.
+
+    They are staggered by whole unrolls, so that episodes do not end together.
+    """
+    none = jnp.zeros(number.shape, bool)
+    count = jnp.zeros(number.shape, jnp.int32)
+    state = jax.vmap(env.reset)(_start_keys(key, number, count))
+    steps = number * longest // lanes // unroll_steps * unroll_steps
+    return Lanes(number, state, steps.astype(jnp.int32), none, state, count, ~none, count)
+
+
+def _start_keys(key: chex.PRNGKey, number: chex.Array, start: chex.Array) -> chex.PRNGKey:
+    return jax.vmap(lambda n, s: jax.random.fold_in(jax.random.fold_in(key, n), s))(number, start)
 
 
 def _restart(env: Env, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
     """Put lanes whose episode is over at their next start.
 
     Starts are drawn for all lanes at once and only when some lane has used its own up: drawn at every
-    step they would cost many times the physics.
+    step they would cost many times the physics. A lane that has not gets the same start again.
     """
     restart: Callable[[State, chex.PRNGKey], State] = getattr(env, "restart", lambda _, key: env.reset(key))
 
-    def draw() -> tuple[State, chex.Array]:
-        keys = jax.random.split(key, lanes.used.shape[0])
-        return jax.vmap(restart)(lanes.state, keys), jnp.zeros_like(lanes.used)
+    def draw() -> tuple[State, chex.Array, chex.Array]:
+        start = lanes.start + lanes.used
+        keys = _start_keys(key, lanes.number, start)
+        return jax.vmap(restart)(lanes.state, keys), start, jnp.zeros_like(lanes.used)
 
-    fresh, used = jax.lax.cond(jnp.any(lanes.ended & lanes.used), draw, lambda: (lanes.fresh, lanes.used))
+    needed = jnp.any(lanes.ended & lanes.used)
+    fresh, start, used = jax.lax.cond(needed, draw, lambda: (lanes.fresh, lanes.start, lanes.used))
 
     def pick(new: chex.Array, old: chex.Array) -> chex.Array:
         return jnp.where(lanes.ended.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-    return Lanes(
+    return lanes._replace(
         state=jax.tree.map(pick, fresh, lanes.state),
         steps=jnp.where(lanes.ended, 0, lanes.steps),
         ended=jnp.zeros_like(lanes.ended),
         fresh=fresh,
+        start=start,
         used=used | lanes.ended,
-        early=lanes.early,
     )
 
 
@@ -73,6 +89,7 @@ def unroll(
     mean: Callable[[chex.Array], chex.Array],
     sigma: chex.Array,
     key: chex.PRNGKey,
+    starts: chex.PRNGKey,
     *,
     unroll_steps: int,
     longest: int,
@@ -81,14 +98,13 @@ def unroll(
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last
     step is `terminated` if the environment says done, and `truncated` if it reached `longest` or if the
-    environment marks its own end with info["truncated"].
+    environment marks its own end with info["truncated"]. The noise follows from `key`, which is this unroll's own;
+    starts from `starts`, which is the key that `begin` had.
     """
-    noise_key, key = jax.random.split(key)
-    noise = jax.random.normal(noise_key, (unroll_steps, lanes.steps.shape[0], env.action_size))
+    noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), (unroll_steps, env.action_size)))
 
-    def step(lanes: Lanes, x: tuple[chex.Array, chex.Array]) -> tuple[Lanes, Transition]:
-        t, noise = x
-        lanes = _restart(env, lanes, jax.random.fold_in(key, t))
+    def step(lanes: Lanes, noise: chex.Array) -> tuple[Lanes, Transition]:
+        lanes = _restart(env, lanes, starts)
         observation = lanes.state.obs
         center = mean(observation)
         action = center + sigma * noise
@@ -110,5 +126,5 @@ def unroll(
         early = lanes.early + (done & (steps < longest))
         return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition
 
-    lanes, transitions = jax.lax.scan(step, lanes, (jnp.arange(unroll_steps), noise))
+    lanes, transitions = jax.lax.scan(step, lanes, jnp.swapaxes(noise(lanes.number), 0, 1))
     return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jax.sharding import SingleDeviceSharding
 
-from qrl import loop
+from qrl import laps
 from qrl.runs import Row, replace_text
 from qrl.train import Point, Trainer, stack
 
@@ -88,7 +88,7 @@ def member_bytes(trainer: Trainer, point: Point) -> int:
     """What a member needs: its state, once more where the program writes it, and its flights."""
     seeds, points = _like([Member(0, 0, point)], 1, None)
     states = jax.eval_shape(trainer.init, seeds, points)
-    flights = jax.eval_shape(trainer.fly, states.learner, points, loop.report_starts(trainer.config))
+    flights = jax.eval_shape(trainer.fly, states.learner, points, laps.report_starts(trainer.config))
     return 2 * _bytes(states) + _bytes(flights)
 
 
@@ -175,20 +175,20 @@ def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
     return jax.ShapeDtypeStruct((size,), np.int32, sharding=sharding), points
 
 
-def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, loop.Programs]:
+def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, laps.Programs]:
     """The first state's program and the others, for chunks of `size` members."""
     seeds, points = _like(members, size, device)
     states = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
         jax.eval_shape(trainer.init, seeds, points),
     )
-    programs = loop.Programs(loop.compile_advance(trainer, states, points), loop.compile_fly(trainer, states, points))
-    return trainer.init.lower(seeds, points).compile(), programs
+    advance, fly = laps.compile_advance(trainer, states, points), laps.compile_fly(trainer, states, points)
+    return trainer.init.lower(seeds, points).compile(), laps.Programs(advance, fly, trainer.on_host)
 
 
 def _chunk(
     group: Group,
-    programs: tuple[Any, loop.Programs],
+    programs: tuple[Any, laps.Programs],
     members: list[Member],
     size: int,
     device: Any,
@@ -202,14 +202,15 @@ def _chunk(
     seeds = jax.device_put(np.asarray([member.seed for member in padded], np.int32), device)
     states = programs[0](seeds, points)
     rows: list[list[Row]] = [[] for _ in members]
-    for lap in loop.laps(states, points, programs[1], group.trainer.config, 0.0, halted):
-        states, env_steps = lap.states, lap.env_steps * len(members)
+    faults: list[str] = []
+    for lap in laps.laps(states, points, programs[1], group.trainer.config, laps.Clock(), halted):
+        faults, env_steps = lap.faults, lap.env_steps * len(members)
         for kept, row in zip(rows, lap.rows, strict=False):  # what fills the chunk up is not kept
             share = {"train_seconds": round(row["train_seconds"] / len(members), 3)}
             kept.append({key: value for key, value in (row | share).items() if key != "steps_per_second"})
         yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
     if all(kept and kept[-1]["env_steps"] == group.steps for kept in rows):
-        results = {member.number: Result(rows[i], loop.fault(states, i)) for i, member in enumerate(members)}
+        results = {member.number: Result(rows[i], faults[i]) for i, member in enumerate(members)}
         _record(folder / f"{members[0].number:07d}.json", results)
         seconds = time.perf_counter() - began
         yield lambda worker: ChunkDone(group, worker, results, seconds)

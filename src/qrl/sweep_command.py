@@ -1,12 +1,10 @@
 """The command `sweep`: a grid file to a folder of results; the same command goes on with an interrupted one."""
 
 import argparse
-import fcntl
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +39,9 @@ def sweep(args: argparse.Namespace) -> int:
         console.print(f"{out}: finished already; nothing to do")
         return _ending(out)
     groups = _groups(grid, process, budget, args.grid)
-    with _locked(out, process):
+    out.mkdir(parents=True, exist_ok=True)
+    busy = f"{out}: another sweep is at work in it; wait for its end, or give another OUT"
+    with processes.locked(out / f"process-{process.number}.lock", busy):
         return _work(args, began, process, budget, grid, groups, out)
 
 
@@ -71,20 +71,6 @@ def _work(
     if process.number:
         return DONE  # process 0 writes the results
     return _finish(out, grid, found, args.grid.stem, time.perf_counter() - began)
-
-
-@contextmanager
-def _locked(out: Path, process: Process) -> Iterator[None]:
-    """The folder, for this process number alone; BadInput if another command holds it."""
-    out.mkdir(parents=True, exist_ok=True)
-    with (out / f"process-{process.number}.lock").open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise BadInput(f"{out}: another sweep is at work in it; wait for its end, or give another OUT") from None
-        except OSError:
-            pass  # a file system without locks
-        yield
 
 
 def _held(out: Path, grid: Grid) -> bool:

@@ -2,8 +2,11 @@
 
 Every value carries a leading member axis (one seed or grid point each). On a CPU members run one after the
 other inside the program (`lax.map`), which is faster there than batching small networks; elsewhere `vmap`.
+
+Over several devices (`spread`) members part first, and then each member's lanes, with their part of ring and minibatch.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 from qrl import buffer, evaluate, rollout
 from qrl.buffer import Ring
@@ -20,6 +25,7 @@ from qrl.learner import Hyper, Learner, LearnerState, Terms, hyper
 from qrl.rollout import Lanes
 from qrl.types import Transition
 
+MEMBER, SHARD = "member", "shard"  # the mesh's axes
 FAULT_TERMS = ("reward", "observation", *Terms._fields)
 
 
@@ -40,7 +46,8 @@ class TrainState(NamedTuple):
     learner: LearnerState
     ring: Ring
     lanes: Lanes
-    key: chex.PRNGKey
+    key: chex.PRNGKey  # of noise and minibatches
+    starts: chex.PRNGKey  # of the lanes' starts
     unrolls: chex.Array  # int32 []
     fault_update: chex.Array  # int32 []: the update in which a number was first not finite; −1: none
     fault_term: chex.Array  # int32 []: which (FAULT_TERMS)
@@ -64,24 +71,89 @@ def stack(members: Sequence[Any]) -> Any:
     return jax.tree.map(lambda *leaves: np.stack(leaves), *members)
 
 
+# How a state lies on a mesh: axis 0 is the member's; a lane is with its shard, and whatever holds no lanes, everywhere.
+LAYOUT: Any = TrainState(*[P(MEMBER)] * len(TrainState._fields))._replace(  # pyright: ignore[reportArgumentType]
+    ring=Ring(P(MEMBER, None, SHARD), P(MEMBER)),  # pyright: ignore[reportArgumentType]
+    lanes=P(MEMBER, SHARD),  # pyright: ignore[reportArgumentType]
+)
+
+
+def spread(devices: Sequence[Any], members: int, shards: int) -> Mesh | None:
+    """The mesh [member, shard] over as many of `devices` as can share the work evenly; None: one is enough.
+
+    Members have no need of each other, and so they part first.
+    """
+    for count in range(len(devices), 1, -1):
+        apart = math.gcd(members, count)
+        if shards % (count // apart) == 0:
+            return Mesh(np.reshape(np.array(devices[:count]), (apart, -1)), (MEMBER, SHARD))
+    return None
+
+
 class Trainer:
     """The compiled programs of one environment and configuration, for any values of what a `Point` holds.
 
     init     (seeds [M], points [M])          -> states [M]
     advance  (states [M], points [M], until)  -> states [M]; donates the states
     fly      (learners [M], points [M], keys) -> Flights [M]
+
+    On one device, or over those of a `mesh` (see `spread`), whose member axis divides M.
     """
 
-    def __init__(self, env: Env, config: Config) -> None:
+    def __init__(self, env: Env, config: Config, mesh: Mesh | None = None) -> None:
         self.env = env
         self.config = config
+        self.mesh = mesh
         self.longest = rollout.episode_steps(env, config.episode_steps)
-        self.learner = Learner(config, int(env.observation_size), env.action_size)  # pyright: ignore[reportArgumentType]
+        sizes = int(env.observation_size), env.action_size  # pyright: ignore[reportArgumentType]
+        self.learner = Learner(config, *sizes, SHARD if mesh else None)
         # Run once, so compiled in haste: a third of the time.
         haste = {"xla_backend_optimization_level": 0} if jax.default_backend() == "cpu" else {}
-        self.init = jax.jit(self._init_all, compiler_options=haste)
-        self.advance = jax.jit(self._advance_all, donate_argnums=0)
-        self.fly = jax.jit(self._fly_all)
+        self.init = jax.jit(self._over_mesh(self._init_all, (P(MEMBER), P(MEMBER)), LAYOUT), compiler_options=haste)
+        self.advance = jax.jit(self._over_mesh(self._advance_all, (LAYOUT, P(MEMBER), P()), LAYOUT), donate_argnums=0)
+        self.fly = jax.jit(self._fly_evenly)
+        everywhere = NamedSharding(mesh, P()) if mesh else None
+        self._everywhere = jax.jit(lambda tree: tree, out_shardings=everywhere)
+        self._member = jax.jit(lambda states, i: jax.tree.map(lambda x: x[i], states), out_shardings=everywhere)
+
+    def place(self, states: TrainState) -> TrainState:
+        """States in NumPy put where the programs want them."""
+        if not (mesh := self.mesh):
+            return jax.tree.map(jnp.asarray, states)
+
+        def put(spec: P, part: Any) -> Any:
+            where = NamedSharding(mesh, spec)
+            return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, where, lambda i, x=x: x[i]), part)
+
+        return jax.tree.map(put, LAYOUT, states, is_leaf=lambda x: isinstance(x, P))
+
+    def on_host(self, tree: Any) -> Any:
+        """Values of the programs in NumPy, wherever their parts are."""
+        return jax.tree.map(np.asarray, self._everywhere(tree) if self.mesh else tree)
+
+    def member(self, states: TrainState, index: int) -> TrainState:
+        """One member's state in NumPy: a copy, for a live view of a device array would cancel its donation."""
+        return jax.tree.map(np.asarray, self._member(states, index))
+
+    def _over_mesh(self, program: Callable[..., Any], specs: Any, out_specs: Any) -> Callable[..., Any]:
+        if not self.mesh:
+            return program
+        # Unchecked: gradients are averaged by hand, all in one exchange.
+        return jax.shard_map(program, mesh=self.mesh, in_specs=specs, out_specs=out_specs, check_vma=False)
+
+    @property
+    def _parts(self) -> int:
+        """How many devices share a member's lanes."""
+        return self.mesh.shape[SHARD] if self.mesh else 1
+
+    def _share(self, count: int) -> chex.Array:
+        """This device's of `count` consecutive numbers."""
+        mine = count // self._parts
+        first = jax.lax.axis_index(SHARD) * mine if self.mesh else 0
+        return first + jnp.arange(mine, dtype=jnp.int32)
+
+    def _sum(self, values: Any) -> Any:
+        return jax.lax.psum(values, SHARD) if self.mesh else values
 
     def _init_all(self, seeds: chex.Array, points: Point) -> TrainState:
         return _over_members(lambda m: self._init(m[0], m[1]), (seeds, points))
@@ -100,6 +172,13 @@ class Trainer:
         ring = after.ring._replace(inserted=jnp.broadcast_to(after.ring.inserted, count))
         return after._replace(unrolls=jnp.broadcast_to(after.unrolls, count), ring=ring)
 
+    def _fly_evenly(self, learners: LearnerState, points: Point, keys: chex.PRNGKey) -> evaluate.Flights:
+        """Every device flies as many starts: a few are flown twice, and dropped."""
+        count = len(keys)
+        even = jnp.resize(keys, (-(-count // self._parts) * self._parts, *keys.shape[1:]))
+        fly = self._over_mesh(self._fly_all, (P(MEMBER), P(MEMBER), P(SHARD)), P(MEMBER, SHARD))
+        return jax.tree.map(lambda x: x[:, :count], fly(learners, points, even))
+
     def _fly_all(self, learners: LearnerState, points: Point, keys: chex.PRNGKey) -> evaluate.Flights:
         return _over_members(lambda m: self._fly(m[0], m[1], keys), (learners, points))
 
@@ -109,17 +188,18 @@ class Trainer:
 
     def _init(self, seed: chex.Array, point: Point) -> TrainState:
         learner, env = self._under(point)
-        learner_key, lanes_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
-        lanes = rollout.begin(env, lanes_key, self.config.lanes, self.longest, self.config.unroll_steps)
+        learner_key, starts, key = jax.random.split(jax.random.PRNGKey(seed), 3)
+        count = self.config.lanes
+        lanes = rollout.begin(env, starts, self._share(count), count, self.longest, self.config.unroll_steps)
         first = learner.init(learner_key)
-        _, transitions = jax.eval_shape(lambda *now: self._collect(learner, *now), first, lanes, key)
+        _, transitions = jax.eval_shape(lambda *now: self._collect(learner, *now), first, lanes, key, starts)
         ring = buffer.create(transitions, self.config.ring_unrolls)
         zero = jnp.float32(0.0)
         totals = Totals(zero, zero, zero, zero, zero, Terms(*[zero] * len(Terms._fields)))
-        return TrainState(first, ring, lanes, key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
+        return TrainState(first, ring, lanes, key, starts, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
 
     def _collect(
-        self, learner: Learner, state: LearnerState, lanes: Lanes, key: chex.PRNGKey
+        self, learner: Learner, state: LearnerState, lanes: Lanes, key: chex.PRNGKey, starts: chex.PRNGKey
     ) -> tuple[Lanes, Transition]:
         return rollout.unroll(
             self.env,  # of any parameters: each lane carries its own
@@ -127,6 +207,7 @@ class Trainer:
             lambda observation: learner.mean(state, observation),
             learner.sigma(state),
             key,
+            starts,
             unroll_steps=self.config.unroll_steps,
             longest=self.longest,
         )
@@ -138,7 +219,7 @@ class Trainer:
 
     def _unroll_and_learn(self, learner: Learner, state: TrainState) -> TrainState:
         collect_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
-        lanes, transitions = self._collect(learner, state.learner, state.lanes, collect_key)
+        lanes, transitions = self._collect(learner, state.learner, state.lanes, collect_key, state.starts)
         observed = learner.observe(state.learner, transitions.observation)
         ring = buffer.add(state.ring, transitions)
 
@@ -146,8 +227,10 @@ class Trainer:
             return learner.update(now, buffer.gather(ring, index))
 
         def learn(now: LearnerState) -> tuple[LearnerState, Terms]:
-            minibatches = (self.config.updates_per_unroll, self.config.minibatch_lanes)
-            return jax.lax.scan(update, now, buffer.draw(ring, learn_key, minibatches))
+            shards = self.config.logical_shards
+            keys = jax.vmap(lambda shard: jax.random.fold_in(learn_key, shard))(self._share(shards))
+            each = self.config.minibatch_lanes // shards
+            return jax.lax.scan(update, now, buffer.draw(ring, keys, self.config.updates_per_unroll, each))
 
         def wait(now: LearnerState) -> tuple[LearnerState, Terms]:
             zeros = jnp.zeros(self.config.updates_per_unroll)
@@ -158,10 +241,10 @@ class Trainer:
         fault_update, fault_term = self._fault(transitions, terms, observed.updates)
         fresh = (state.fault_update < 0) & (fault_update >= 0)
         seen = Totals(
-            rewards=jnp.sum(transitions.reward),
+            rewards=self._sum(jnp.sum(transitions.reward)),
             steps=jnp.float32(self.config.unroll_size),
-            episodes=jnp.sum(transitions.terminated + transitions.truncated),
-            early=jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32),
+            episodes=self._sum(jnp.sum(transitions.terminated + transitions.truncated)),
+            early=self._sum(jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32)),
             updates=(learned.updates - observed.updates).astype(jnp.float32),
             terms=jax.tree.map(jnp.sum, terms),
         )
@@ -170,6 +253,7 @@ class Trainer:
             ring=ring,
             lanes=lanes,
             key=state.key,
+            starts=state.starts,
             unrolls=state.unrolls + 1,
             fault_update=jnp.where(fresh, fault_update, state.fault_update),
             fault_term=jnp.where(fresh, fault_term, state.fault_term),
@@ -178,7 +262,7 @@ class Trainer:
 
     def _fault(self, seen: Transition, terms: Terms, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
         """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are."""
-        collected = jnp.stack([jnp.all(jnp.isfinite(x)) for x in (seen.reward, seen.next_observation)])
+        collected = self._sum(jnp.stack([jnp.sum(~jnp.isfinite(x)) for x in (seen.reward, seen.next_observation)])) == 0
         finite = jnp.concatenate(
             [jnp.tile(collected, (self.config.updates_per_unroll, 1)), jnp.isfinite(jnp.stack(terms, axis=1))], axis=1
         )

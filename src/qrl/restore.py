@@ -1,0 +1,67 @@
+"""From a run folder's checkpoints back to a training state: to go on with, or to look at."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+from brax.envs.base import Env
+
+from qrl import checkpoint, laps
+from qrl.checkpoint import Damaged, Record
+from qrl.runs import RunConfig
+from qrl.train import Point, Trainer, TrainState, point, stack
+
+
+class Restored(NamedTuple):
+    """Where a run goes on."""
+
+    env_steps: int  # 0: from the start, for nothing whole was saved
+    states: TrainState | None  # NumPy; leading axis: members
+    records: list[Record]  # of each member
+    notes: list[str]  # what was wrong with later checkpoints, and what became of them
+
+
+def shapes(trainer: Trainer, points: Point) -> TrainState:
+    """Shapes and types of the states of as many members as there are `points`."""
+    return jax.eval_shape(trainer.init, laps.seeds(0, len(jax.tree.leaves(points)[0])), points)
+
+
+def latest(folders: list[Path], like: TrainState) -> Restored:
+    """The last checkpoint that is whole in every member's folder; `like`: shapes and types of all their states.
+
+    What is damaged, or was never finished, is set aside; what is later goes: it will be made again, the same.
+    Raises checkpoint.Foreign, with nothing touched, where what was saved is of something else.
+    """
+    one, notes = _one(like), []
+    common = set.intersection(*[set(checkpoint.steps(folder)) for folder in folders])
+    for env_steps in sorted(common, reverse=True):
+        try:
+            found = [checkpoint.read(folder, env_steps, one) for folder in folders]
+        except Damaged as error:
+            notes.append(str(error))
+            continue
+        break
+    else:
+        env_steps, found = 0, []
+    for folder in folders:
+        checkpoint.clear_after(folder, env_steps)
+    states = stack([each.state for each in found]) if found else None
+    return Restored(env_steps, states, [each.record for each in found], notes)
+
+
+def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState, int]:
+    """Trainer, state (leading axis: one member) and environment steps of a seed's last checkpoint.
+
+    Raises FileNotFoundError, naming the folder, where there is none; OSError where it is not whole.
+    """
+    saved = checkpoint.steps(folder)
+    if not saved:
+        raise FileNotFoundError(f"{folder}: no checkpoint")
+    trainer = Trainer(env, run.learner)
+    found = checkpoint.read(folder, saved[0], _one(shapes(trainer, stack([point(env, run.learner)]))))
+    return trainer, trainer.place(stack([found.state])), found.env_steps
+
+
+def _one(states: Any) -> Any:
+    """Shapes and types of one member."""
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
