@@ -27,7 +27,7 @@ add = jax.jit(buffer.add)
 @jax.jit
 def sample(ring: Ring, key: jax.Array) -> Any:
     """BATCH trajectories, drawn as two minibatches at once."""
-    return buffer.gather(ring, buffer.draw(ring, key, (2, BATCH // 2)).reshape(BATCH))
+    return buffer.gather(ring, buffer.draw(ring, key[None], 2, BATCH // 2).reshape(BATCH))
 
 
 def tag(unroll: Array | int, lane: Array | int) -> Array:
@@ -143,6 +143,33 @@ def test_samples_are_uniform_and_independent(adds: int, ring_after: list[Ring]) 
         np.add.at(pairs, (index[0::2], index[1::2]), 1)
     assert stats.chisquare(count).pvalue > 0.001
     assert stats.chisquare(pairs.ravel()).pvalue > 0.001
+
+
+@pytest.mark.parametrize("adds", [2, SLOTS + 1])
+def test_shards_draw_their_part_of_each_minibatch_from_their_own_lanes(adds: int) -> None:
+    """As a ring of those lanes alone would with the same key: so it does not matter which shards share a device."""
+    shards, width, each, minibatches = 3, 2, 64, 4
+
+    def ring_of(lanes: Array) -> Ring:
+        ring = buffer.create({"x": np.zeros((len(lanes), 1), np.int32)}, SLOTS)
+        for i in range(adds):
+            ring = add(ring, {"x": (100 * i + lanes)[:, None].astype(np.int32)})
+        return ring
+
+    def drawn(lanes: Array, keys: jax.Array) -> Array:
+        ring = ring_of(lanes)
+        index = buffer.draw(ring, keys, minibatches, each)
+        assert index.shape == (minibatches, len(keys) * each)
+        return np.asarray(buffer.gather(ring, index)["x"])[..., 0]
+
+    keys = jax.random.split(jax.random.key(0), shards)
+    whole = drawn(np.arange(shards * width), keys).reshape(minibatches, shards, each)
+    for shard in range(shards):
+        lanes = np.arange(shard * width, (shard + 1) * width)
+        np.testing.assert_array_equal(whole[:, shard], drawn(lanes, keys[shard, None]))
+        held = [100 * i + lane for i in range(max(0, adds - SLOTS), adds) for lane in lanes]
+        np.testing.assert_array_equal(np.unique(whole[:, shard]), held)
+    assert (whole[:, 0] % width != whole[:, 1] % width).any()  # they do not draw alike
 
 
 def test_the_key_decides_the_sample(ring_after: list[Ring]) -> None:

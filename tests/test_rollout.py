@@ -91,20 +91,21 @@ def quick_compilation() -> Iterator[None]:
 
 @functools.cache
 def begin_of(env: Env) -> Callable[[jax.Array], Lanes]:
-    return jax.jit(lambda key: rollout.begin(env, key, LANES, LONGEST, T))
+    return jax.jit(lambda key: rollout.begin(env, key, jnp.arange(LANES), LANES, LONGEST, T))
 
 
 @functools.cache
 def unroll_of(env: Env) -> Callable[..., tuple[Lanes, Transition]]:
+    sigma = jnp.float32(SIGMA)
     return jax.jit(
-        lambda lanes, key: rollout.unroll(env, lanes, mean, jnp.float32(SIGMA), key, unroll_steps=T, longest=LONGEST)
+        lambda lanes, key, starts: rollout.unroll(env, lanes, mean, sigma, key, starts, unroll_steps=T, longest=LONGEST)
     )
 
 
 def fly(env: Fenced, lanes: Lanes, seed: int) -> Flight:
     begun, unrolls = lanes, []
     for i in range(UNROLLS):
-        lanes, transitions = unroll_of(env)(lanes, jax.random.key(1000 * seed + i))
+        lanes, transitions = unroll_of(env)(lanes, jax.random.key(1000 * seed + i), jax.random.key(seed))
         unrolls.append(transitions)
     steps = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *unrolls)
     return Flight(env, begun, lanes, steps)
@@ -237,7 +238,9 @@ def test_episodes_are_cut_at_the_longest(unfenced: Flight) -> None:
 @pytest.mark.parametrize(("lanes", "longest", "unroll_steps"), [(8, 40, 10), (7, 200, 50), (3, 100, 50), (5, 30, 50)])
 def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll_steps: int) -> None:
     """Ages are multiples of an unroll, below the longest episode, spread over it as evenly as whole lanes can be."""
-    begun = jax.jit(lambda key: rollout.begin(PLAIN, key, lanes, longest, unroll_steps))(jax.random.key(0))
+    begun = jax.jit(lambda key: rollout.begin(PLAIN, key, jnp.arange(lanes), lanes, longest, unroll_steps))(
+        jax.random.key(0)
+    )
     ages = np.asarray(begun.steps)
     assert (ages % unroll_steps == 0).all()
     assert ages.min() == 0
@@ -289,7 +292,7 @@ def test_noise_is_standard_normal_and_never_repeats(flight: Flight) -> None:
 def test_the_key_decides_everything() -> None:
     """The same key repeats an unroll to the last bit, another changes every action."""
     lanes = begin(MARKED, seed=3)
-    first, again, other = (unroll_of(MARKED)(lanes, jax.random.key(seed)) for seed in (0, 0, 1))
+    first, again, other = (unroll_of(MARKED)(lanes, jax.random.key(i), jax.random.key(3)) for i in (0, 0, 1))
     for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, two)
     assert (np.asarray(first[1].action) != other[1].action).all()
@@ -299,11 +302,29 @@ def test_members_side_by_side_fly_as_they_would_alone() -> None:
     """vmapped, the draw of fresh starts under a condition becomes a selection: nothing else may change."""
     lanes = [begin(MARKED, seed) for seed in (4, 5)]
     keys = jax.random.split(jax.random.key(6), 2)
-    together = jax.jit(jax.vmap(unroll_of(MARKED)))(jax.tree.map(lambda *x: jnp.stack(x), *lanes), keys)
+    together = jax.jit(jax.vmap(unroll_of(MARKED)))(jax.tree.map(lambda *x: jnp.stack(x), *lanes), keys, keys)
     for member in (0, 1):
-        alone = unroll_of(MARKED)(lanes[member], keys[member])
+        alone = unroll_of(MARKED)(lanes[member], keys[member], keys[member])
         for ours, expected in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(ours[member], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_lane_flies_as_it_would_without_its_neighbours() -> None:
+    """Starts, noise and stagger are a lane's own: half the lanes alone make the transitions that they make in a whole.
+
+    Neighbours decide when starts are drawn, and must not decide which.
+    """
+    begun = begin(MARKED, seed=7)
+    whole = fly(MARKED, begun, seed=7).steps
+    assert ends(whole).sum() > 3 * LANES
+    for half in (slice(0, 3), slice(3, 6)):
+        alone = fly(MARKED, jax.tree.map(lambda x, half=half: x[half], begun), seed=7).steps
+        for ours, expected in zip(alone, whole, strict=True):
+            np.testing.assert_allclose(ours, expected[half], rtol=1e-5, atol=1e-5)
+    first = jax.jit(lambda key: rollout.begin(MARKED, key, jnp.arange(3, 6), LANES, LONGEST, T))(jax.random.key(7))
+    of_all = begin_of(MARKED)(jax.random.key(7))
+    np.testing.assert_array_equal(first.state.obs, of_all.state.obs[3:])
+    np.testing.assert_array_equal(first.steps, of_all.steps[3:])
 
 
 def test_lanes_are_handed_on_before_the_reset(flight: Flight) -> None:
@@ -329,8 +350,8 @@ def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
 
     @jax.jit
     def run(key: jax.Array) -> tuple[Lanes, Transition]:
-        lanes = rollout.begin(env, key, 4, 100, 50)
-        return lanes, rollout.unroll(env, lanes, still, sigma, key, unroll_steps=50, longest=100)[1]
+        lanes = rollout.begin(env, key, jnp.arange(4), 4, 100, 50)
+        return lanes, rollout.unroll(env, lanes, still, sigma, key, key, unroll_steps=50, longest=100)[1]
 
     lanes, steps = run(jax.random.key(0))
     step, fled = jax.jit(env.step), 0

@@ -119,11 +119,11 @@ class Trainer:
     def place(self, states: TrainState) -> TrainState:
         """States in NumPy put where the programs want them."""
         if not (mesh := self.mesh):
-            return jax.tree.map(jnp.asarray, states)
+            return jax.tree.map(jnp.array, states)
 
         def put(spec: P, part: Any) -> Any:
             where = NamedSharding(mesh, spec)
-            return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, where, lambda i, x=x: x[i]), part)
+            return jax.tree.map(lambda x: jax.make_array_from_callback(x.shape, where, np.asarray(x).__getitem__), part)
 
         return jax.tree.map(put, LAYOUT, states, is_leaf=lambda x: isinstance(x, P))
 

@@ -1,0 +1,55 @@
+"""Train a little over 1, 2 and 8 of the devices that there are; what comes of it goes into a folder.
+
+A program of its own, for `test_devices`: how many devices a CPU has is settled before JAX starts.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from qrl import laps, runs
+from qrl.config import Config
+from qrl.train import Trainer, point, spread, stack
+from qrl_envs import env as worlds
+
+LITTLE = {
+    "lanes": 16,
+    "unroll_steps": 10,
+    "episode_steps": 20,
+    "ring_unrolls": 3,
+    "warmup_unrolls": 2,
+    "updates_per_unroll": 5,
+    "minibatch_lanes": 16,
+    "policy_hidden": [16],
+    "critic_hidden": [16],
+    "normalise_observations": True,
+    "report_flights": 5,
+}
+TEN_UPDATES = 3  # unrolls
+
+
+def named(tree: Any) -> dict[str, np.ndarray]:
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def main(folder: Path) -> None:
+    env = worlds.make("pendulum")
+    config = Config.model_validate(runs.preset("pendulum") | LITTLE, strict=False)
+    saved = None
+    for seeds, count in ((1, 1), (1, 2), (1, 8), (2, 8)):
+        points = stack([point(env, config)] * seeds)
+        trainer = Trainer(env, config, spread(jax.devices()[:count], seeds, config.logical_shards))
+        states = trainer.advance(trainer.init(laps.seeds(5, seeds), points), points, np.int32(TEN_UPDATES))
+        flights = trainer.fly(states.learner, points, laps.report_starts(config))
+        np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.on_host((states, flights))))
+        if seeds == 1:
+            saved = saved or trainer.member(states, 0)  # from one device, as a checkpoint has it
+            further = trainer.advance(trainer.place(stack([saved])), points, np.int32(TEN_UPDATES + 1))
+            np.savez(folder / f"further-{count}.npz", **named(trainer.on_host(further)))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
