@@ -31,7 +31,7 @@ def test_every_hyperparameter_is_declared_traced_or_static() -> None:
     """Once each; counts, shapes and choices can only be static, and what is traced is a number or numbers."""
     for name, field in Config.model_fields.items():
         assert len({"traced", "static"} & set(field.metadata)) == 1, name
-    config = Config.model_validate(request.preset(request.task_record("hover")), strict=False)
+    config = Config.model_validate(request.preset(request.task_record("hover"), ""), strict=False)
     assert set(TRACED) - set(config.traced) == {"xi"}  # null there
     assert all(isinstance(v, float) or all(isinstance(x, float) for x in v) for v in config.traced.values())
     assert not set(config.static) & set(TRACED)
@@ -45,7 +45,7 @@ def test_shipped_grids_are_valid(path: Path) -> None:
     assert len(found.groups()) == programs[path.stem]
     for point in found.points:
         assert point.learner.steps <= 3e6
-        request.check(request.environment(point.task), point.learner)
+        request.check(request.environment(point.task), point.learner, "")
 
 
 def test_the_three_grids_of_the_paper_ship() -> None:
