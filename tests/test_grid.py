@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from qrl import grid, request
+from qrl.axes import Axis
 from qrl.config import TRACED, Config
 from qrl_envs.specfile import BadInput
 
@@ -249,3 +250,12 @@ def test_wrong_grids_are_refused_in_a_line(tmp_path: Path, data: dict, words: st
         load(tmp_path, {"task": "pendulum", **data})
     assert "\n" not in str(refused.value)
     assert str(refused.value).startswith(str(tmp_path / "grid.json"))
+
+
+def test_a_sample_that_its_axes_cannot_fill_is_refused_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once nothing new has come for long, however many were asked for."""
+    drawn, draw = [], Axis.draw
+    monkeypatch.setattr(Axis, "draw", lambda self, rng: drawn.append(1) or draw(self, rng))
+    with pytest.raises(BadInput, match=r"found 40,000; 2 different ones were drawn"):
+        load(tmp_path, {"task": "pendulum", "axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 40_000}})
+    assert len(drawn) < 2000

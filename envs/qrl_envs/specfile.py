@@ -10,7 +10,6 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
-
 LONGEST_MESSAGE = 900  # characters
 
 

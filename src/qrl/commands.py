@@ -87,7 +87,9 @@ def train(args: argparse.Namespace) -> int:
             console.print(f"{out}: finished already; nothing to do")
             return DONE
     env = request.environment(config.task)
-    request.check(env, config.learner, "command line" if "observation_scale" in flags else str(args.config or config.task.name))
+    request.check(
+        env, config.learner, "command line" if "observation_scale" in flags else str(args.config or config.task.name)
+    )
     _prepare(out, config, held)
     seeds = f"seed {config.seed}" if config.seeds == 1 else f"{config.seeds} seeds from {config.seed}"
     console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {config.devices[0]} -> {out}")

@@ -136,7 +136,9 @@ def check(env: Env, learner: Config, where: str) -> None:
     """Whether the learner can train on this environment at all; `where` is who asks for it."""
     size = env.observation_size
     if not isinstance(size, int):
-        raise BadInput(f"{where}: this environment's observation is not one flat vector, which is all that qrl trains on")
+        raise BadInput(
+            f"{where}: this environment's observation is not one flat vector, which is all that qrl trains on"
+        )
     given = len(learner.observation_scale or ())
     if given not in (0, size):
         raise BadInput(

@@ -135,7 +135,9 @@ def read_metrics(folder: Path) -> list[Row]:
         with path.open(newline="", encoding="utf-8") as file:
             header, *lines = csv.reader(file)
         rows = [dict(zip(header, map(_number, line), strict=True)) for line in lines]
-        if not set(REPORTED) <= set(header) or any(math.isnan(r["env_steps"] + r["train_seconds"]) for r in rows):
+        if not set(REPORTED) <= set(header) or not all(
+            math.isfinite(row["env_steps"] + row["train_seconds"]) for row in rows
+        ):
             raise ValueError("expected the columns of a run's reports")
     except (ValueError, csv.Error) as error:
         raise OSError(f"{path}: cannot be read ({str(error)[:120]})") from None

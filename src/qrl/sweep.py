@@ -219,7 +219,10 @@ def _chunk(
 def record(results: dict[int, Result]) -> dict[str, Any]:
     """What a chunk's file holds. Numbers that are not finite as text: JSON has none."""
     members = {
-        str(i): {"rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows], "diverged": why}
+        str(i): {
+            "rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows],
+            "diverged": why,
+        }
         for i, (rows, why) in results.items()
     }
     return {"members": members, "crc32": _sum(members)}
