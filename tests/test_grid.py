@@ -256,6 +256,6 @@ def test_a_sample_that_its_axes_cannot_fill_is_refused_soon(tmp_path: Path, monk
     """Once nothing new has come for long, however many were asked for."""
     drawn, draw = [], Axis.draw
     monkeypatch.setattr(Axis, "draw", lambda self, rng: drawn.append(1) or draw(self, rng))
-    with pytest.raises(BadInput, match=r"found 40,000; 2 different ones were drawn"):
-        load(tmp_path, {"task": "pendulum", "axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 40_000}})
+    with pytest.raises(BadInput, match=r"found 9,000; 2 different ones were drawn"):
+        load(tmp_path, {"task": "pendulum", "axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 9000}})
     assert len(drawn) < 2000
