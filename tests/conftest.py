@@ -7,11 +7,18 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded; as
 
 import jax
 import pytest
+from hypothesis import settings
 
 from frontdoor import TINY, qrl
 from machines import need
 from qrl.export import targets
 from qrl.export.targets import Core
+
+# Chosen by --hypothesis-profile. The default's cases are the same each time; those of the torture are others.
+# The deadline of a case is for what hangs: the machine may be busy.
+settings.register_profile("default", max_examples=100, deadline=10_000, derandomize=True, database=None)
+settings.register_profile("torture", max_examples=10_000, deadline=10_000, database=None, print_blob=True)
+settings.load_profile("default")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from qrl import grid, request
+from qrl.axes import Axis
 from qrl.config import TRACED, Config
 from qrl_envs.specfile import BadInput
 
@@ -31,7 +32,7 @@ def test_every_hyperparameter_is_declared_traced_or_static() -> None:
     """Once each; counts, shapes and choices can only be static, and what is traced is a number or numbers."""
     for name, field in Config.model_fields.items():
         assert len({"traced", "static"} & set(field.metadata)) == 1, name
-    config = Config.model_validate(request.preset(request.task_record("hover")), strict=False)
+    config = Config.model_validate(request.preset(request.task_record("hover"), ""), strict=False)
     assert set(TRACED) - set(config.traced) == {"xi"}  # null there
     assert all(isinstance(v, float) or all(isinstance(x, float) for x in v) for v in config.traced.values())
     assert not set(config.static) & set(TRACED)
@@ -45,7 +46,7 @@ def test_shipped_grids_are_valid(path: Path) -> None:
     assert len(found.groups()) == programs[path.stem]
     for point in found.points:
         assert point.learner.steps <= 3e6
-        request.check(request.environment(point.task), point.learner)
+        request.check(request.environment(point.task), point.learner, "")
 
 
 def test_the_three_grids_of_the_paper_ship() -> None:
@@ -249,3 +250,12 @@ def test_wrong_grids_are_refused_in_a_line(tmp_path: Path, data: dict, words: st
         load(tmp_path, {"task": "pendulum", **data})
     assert "\n" not in str(refused.value)
     assert str(refused.value).startswith(str(tmp_path / "grid.json"))
+
+
+def test_a_sample_that_its_axes_cannot_fill_is_refused_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once nothing new has come for long, however many were asked for."""
+    drawn, draw = [], Axis.draw
+    monkeypatch.setattr(Axis, "draw", lambda self, rng: drawn.append(1) or draw(self, rng))
+    with pytest.raises(BadInput, match=r"found 9,000; 2 different ones were drawn"):
+        load(tmp_path, {"task": "pendulum", "axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 9000}})
+    assert len(drawn) < 2000

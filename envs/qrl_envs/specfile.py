@@ -10,12 +10,16 @@ from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 
+LONGEST_MESSAGE = 900  # characters
+
 
 class BadInput(ValueError):
     """The user's input is wrong. The message is one line: where, which key, what was expected."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(message.split()))  # keys and values may hold line breaks of their own
+        # Keys and values may hold line breaks and the terminal's control codes, and be long.
+        line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+        super().__init__(line if len(line) <= LONGEST_MESSAGE else line[: LONGEST_MESSAGE - 1] + "…")
 
 
 class Spec(BaseModel):
@@ -52,11 +56,12 @@ def read(path: Path) -> dict[str, Any]:
     """The JSON object in the file at `path`; BadInput if unreadable, not JSON, not an object, or a key stands twice."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        keys = [key for key, _ in pairs]
-        for key in keys:
-            if keys.count(key) > 1:
+        data: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in data:
                 raise BadInput(f"{path}: key '{key}' stands twice")
-        return dict(pairs)
+            data[key] = value
+        return data
 
     try:
         data = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=unique)

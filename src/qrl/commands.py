@@ -121,7 +121,8 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
         if changed := request.other_versions(config.versions):
             console.print(f"other versions than it began with, so the bits may differ: {changed}")
     env = request.environment(config.task)
-    request.check(env, config.learner)
+    where = "command line" if "observation_scale" in flags else str(args.config or config.task.name)
+    request.check(env, config.learner, where)
     request.check_devices(config)
     out.mkdir(parents=True, exist_ok=True)
     until_done.enter_context(processes.locked(out / "lock", f"{out}: another process is at work in it"))

@@ -30,8 +30,7 @@ class Sample(Spec):
 
 
 def _seeds(value: Any) -> Any:
-    whole = isinstance(value, int | float) and not isinstance(value, bool) and float(value).is_integer()
-    if whole and 0 <= value < 2**20:
+    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < 2**20 and value % 1 == 0:
         return tuple(range(int(value)))
     return tuple(value) if isinstance(value, list) else value
 
@@ -113,17 +112,14 @@ def load(path: Path, budget_bytes: float) -> Grid:
     file = specfile.build(GridFile, specfile.read(path), str(path))
     if len(set(file.seeds)) < len(file.seeds):
         raise BadInput(f"{path}: key 'seeds': expected each seed once, found {list(file.seeds)}")
-    try:
-        task = request.task_record(file.task)
-    except BadInput as error:
-        raise BadInput(f"{path}: key 'task': {error}") from None
+    task = request.task_named(file.task, path)
     known = settable(task)
     axes = {
         name: axis(name, value, known, str(path), sampled=file.sample is not None) for name, value in file.axes.items()
     }
     refuse_clashes(file.fixed, axes, known, str(path))
     count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
-    reports = file.fixed.get("reports", request.preset(task)["reports"])
+    reports = file.fixed.get("reports", request.preset(task, str(path))["reports"])
     kept = (
         len(file.seeds)
         * REPORT_BYTES
@@ -180,9 +176,10 @@ def _sampled(axes: dict[str, Axis | Range], sample: Sample, where: str) -> list[
     """Points drawn at random, each different from those before it."""
     rng = np.random.default_rng(sample.seed)
     places: dict[str, dict[str, Any]] = {}
-    for _ in range(20 * sample.count + 1000):
+    idle = 0  # draws since the last that was new; where one of n + 1 points is left, n draws in a row on average
+    while idle < 20 * len(places) + 1000:
         place = {name: axis.draw(rng) for name, axis in axes.items()}
-        places.setdefault(json.dumps(place), place)
+        idle = 0 if places.setdefault(json.dumps(place), place) is place else idle + 1
         if len(places) == sample.count:
             return list(places.values())
     raise BadInput(
@@ -206,4 +203,4 @@ def _point(
     if spec is not task.spec:
         checked = tasks.from_data(spec, f"{where}: task").model_dump(mode="json", exclude_none=True)
         task = TaskRecord(name=task.name, spec=checked)
-    return GridPoint(place, task, specfile.build(Config, request.preset(task) | learner, where))
+    return GridPoint(place, task, specfile.build(Config, request.preset(task, where) | learner, where))

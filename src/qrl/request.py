@@ -1,5 +1,6 @@
 """From what the user asked (task, flags, CONFIG, run folder) to a run that can start; BadInput if it cannot."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from qrl_envs import specfile
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
 
+MOST_SEEDS = 10_000  # of one program
+
 
 def foreign_tasks() -> list[str]:
     """Brax's own environments, which can be trained by name too."""
@@ -28,7 +31,23 @@ def task_record(name: str) -> TaskRecord:
         return TaskRecord(name=name, spec=None)
     if name not in tasks.shipped() and not name.endswith(".json"):
         raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*tasks.shipped(), *foreign_tasks()])}")
-    return TaskRecord(name=Path(name).stem, spec=tasks.load(name).model_dump(mode="json", exclude_none=True))
+    spec = tasks.load(name).model_dump(mode="json", exclude_none=True)
+    return TaskRecord(name=_folder(Path(name).stem, name), spec=spec)
+
+
+def task_named(name: str, path: Path) -> TaskRecord:
+    """The task that the file at `path` names."""
+    try:
+        return task_record(name)
+    except BadInput as error:
+        raise BadInput(f"{path}: key 'task': {error}") from None
+
+
+def _folder(name: str, where: str) -> str:
+    """A task's name, which its run's folder bears too."""
+    if not name.strip(".") or set("/\0") & set(name) or len(os.fsencode(name)) > 255:
+        raise BadInput(f"{where}: expected a task whose name can be a folder's, found '{name}'")
+    return name
 
 
 def environment(record: TaskRecord) -> Env:
@@ -45,7 +64,7 @@ def config_file(path: Path | None) -> ConfigFile:
     file = specfile.build(ConfigFile, specfile.read(path), str(path))
     record = file.task
     if isinstance(record, str):
-        record = task_record(record)
+        record = task_named(record, path)
     elif record:
         record = _checked(record, str(path))
     return file.model_copy(update={"task": record})
@@ -54,7 +73,7 @@ def config_file(path: Path | None) -> ConfigFile:
 def _checked(record: TaskRecord, where: str) -> TaskRecord:
     if record.spec is not None:
         spec = tasks.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
-        return TaskRecord(name=record.name, spec=spec)
+        return TaskRecord(name=_folder(record.name, f"{where}: key 'task.name'"), spec=spec)
     if record.name not in foreign_tasks():
         raise BadInput(f"{where}: key 'task.name': unknown task '{record.name}'")
     return record
@@ -73,26 +92,39 @@ def run_config(
         record = asked
     if not record:
         raise BadInput(f"no task given (known: {', '.join(tasks.shipped())}; all: qrl tasks)")
-    return RunConfig(
+    run = RunConfig(
         task=record,
-        learner=_learner(record, config, file.learner, flags),
+        learner=_learner(record, task or str(config), config, file.learner, flags),
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=runs.versions(),
         devices=[str(device) for device in jax.devices()],
     )
+    return _countable(run, str(config or "command line"))
 
 
-def preset(record: TaskRecord) -> dict[str, Any]:
-    """The learner's defaults for a task."""
+def _countable(run: RunConfig, where: str) -> RunConfig:
+    """`run`, if each of its seeds can have its folder, and its number in the program."""
+    if run.seeds > MOST_SEEDS or run.seed + run.seeds > 2**31:
+        raise BadInput(
+            f"{where}: expected at most {MOST_SEEDS:,} seeds, all of them below {2**31:,},"
+            f" found {run.seeds:,} from {run.seed:,}"
+        )
+    return run
+
+
+def preset(record: TaskRecord, where: str) -> dict[str, Any]:
+    """The learner's defaults for a task, which `where` names."""
     name = record.spec["preset"] if record.spec else "default"
     if name not in runs.presets():
-        raise BadInput(f"{record.name}: key 'preset': no preset '{name}'{specfile.nearest(name, runs.presets())}")
+        raise BadInput(f"{where}: the task's key 'preset': no preset '{name}'{specfile.nearest(name, runs.presets())}")
     return runs.preset(name)
 
 
-def _learner(record: TaskRecord, config: Path | None, learner: dict[str, Any], flags: dict[str, Any]) -> Config:
-    base = preset(record) | learner
+def _learner(
+    record: TaskRecord, where: str, config: Path | None, learner: dict[str, Any], flags: dict[str, Any]
+) -> Config:
+    base = preset(record, where) | learner
     file = f"{config}: learner" if config else f"preset of {record.name}"
     try:
         return specfile.build(Config, base | flags, "command line")
@@ -101,19 +133,23 @@ def _learner(record: TaskRecord, config: Path | None, learner: dict[str, Any], f
         raise
 
 
-def check(env: Env, learner: Config) -> None:
-    """Whether the learner can train on this environment at all."""
+def check(env: Env, learner: Config, where: str) -> None:
+    """Whether the learner can train on this environment at all; `where` is who asks for it."""
     size = env.observation_size
     if not isinstance(size, int):
-        raise BadInput("this environment's observation is not one flat vector, which is all that qrl trains on")
+        raise BadInput(
+            f"{where}: this environment's observation is not one flat vector, which is all that qrl trains on"
+        )
     given = len(learner.observation_scale or ())
     if given not in (0, size):
-        raise BadInput(f"key 'observation_scale': expected {size} numbers, one for each observation, found {given}")
+        raise BadInput(
+            f"{where}: key 'observation_scale': expected {size} numbers, one for each observation, found {given}"
+        )
     try:
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
     except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
-        raise BadInput(f"this environment does not work with jax {jax.__version__}: {error}") from None
+        raise BadInput(f"{where}: this environment does not work with jax {jax.__version__}: {error}") from None
 
 
 def devices(run: RunConfig) -> str:
@@ -147,7 +183,7 @@ def stored(folder: Path) -> RunConfig:
     if not path.exists():
         raise BadInput(f"{folder}: not a run folder (no config.json)")
     run = specfile.build(RunConfig, specfile.read(path), str(path))
-    return run.model_copy(update={"task": _checked(run.task, str(path))})
+    return _countable(run.model_copy(update={"task": _checked(run.task, str(path))}), str(path))
 
 
 def resumed(folder: Path, asked: RunConfig, given: dict[str, Any], seed: int | None, seeds: int | None) -> RunConfig:

@@ -19,11 +19,10 @@ Finding = dict[str, Any]  # of one point: place, seeds, how many diverged, quart
 
 def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
     """A row for each point and seed: the point's place, the seed, and its last report."""
-    rows = [
+    return [
         {**_label(grid, index), "diverged": result.diverged, **result.rows[-1]}
         for index, result in sorted(results.items())
     ]
-    return _squared(rows)
 
 
 def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
@@ -43,12 +42,6 @@ def _label(grid: Grid, index: int) -> dict[str, Any]:
 
 def _cell(value: Any) -> Any:
     return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
-
-
-def _squared(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The same columns in every row: points of different tasks measure different things."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    return [{name: row.get(name, math.nan) for name in names} for row in rows]
 
 
 def findings(grid: Grid, results: dict[int, Result]) -> list[Finding]:

@@ -123,19 +123,30 @@ def _plain(data: Any) -> Any:
 
 
 Row = dict[str, float | int]
+REPORTED = ("env_steps", "updates", "return_mean", "return_min", "success", "train_seconds")  # by every run
 
 
 def read_metrics(folder: Path) -> list[Row]:
-    """The rows of metrics.csv; an empty cell (not measured) is NaN."""
+    """The rows of metrics.csv; an empty cell (not measured) is NaN. OSError, naming the file, if it is damaged."""
     path = folder / "metrics.csv"
     if not path.exists():
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return [{key: _number(cell) for key, cell in row.items()} for row in csv.DictReader(file)]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *lines = csv.reader(file)
+        rows = [dict(zip(header, map(_number, line), strict=True)) for line in lines]
+        if not set(REPORTED) <= set(header) or not all(
+            math.isfinite(row["env_steps"] + row["train_seconds"]) for row in rows
+        ):
+            raise ValueError("expected the columns of a run's reports")
+    except (ValueError, csv.Error) as error:
+        raise OSError(f"{path}: cannot be read ({str(error)[:120]})") from None
+    return rows
 
 
 def _number(cell: str) -> float | int:
-    return int(cell) if cell.lstrip("-").isdigit() else float(cell or "nan")
+    number = float(cell or "nan")
+    return int(number) if abs(number) < 2**53 and cell.lstrip("-").isdigit() else number
 
 
 def write_metrics(folder: Path, rows: list[Row]) -> None:
@@ -144,9 +155,10 @@ def write_metrics(folder: Path, rows: list[Row]) -> None:
 
 
 def csv_text(rows: list[dict[str, Any]]) -> str:
-    """Rows of one header as CSV; NaN (not measured) is an empty cell."""
+    """Rows as CSV, the same columns in each; NaN (not measured) is an empty cell."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, fieldnames=list(names), lineterminator="\n")
     writer.writeheader()
     writer.writerows(
         {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}

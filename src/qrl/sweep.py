@@ -8,6 +8,7 @@ import json
 import math
 import threading
 import time
+import zlib
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -211,18 +212,26 @@ def _chunk(
         yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
     if all(kept and kept[-1]["env_steps"] == group.steps for kept in rows):
         results = {member.number: Result(rows[i], faults[i]) for i, member in enumerate(members)}
-        _record(folder / f"{members[0].number:07d}.json", results)
+        replace_text(folder / f"{members[0].number:07d}.json", json.dumps(record(results)) + "\n")
         seconds = time.perf_counter() - began
         yield lambda worker: ChunkDone(group, worker, results, seconds)
 
 
-def _record(path: Path, results: dict[int, Result]) -> None:
-    # Numbers that are not finite as text: JSON has none.
+def record(results: dict[int, Result]) -> dict[str, Any]:
+    """What a chunk's file holds. Numbers that are not finite as text: JSON has none."""
     members = {
-        index: {"rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows], "diverged": why}
-        for index, (rows, why) in results.items()
+        str(i): {
+            "rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows],
+            "diverged": why,
+        }
+        for i, (rows, why) in results.items()
     }
-    replace_text(path, json.dumps({"members": members}) + "\n")
+    return {"members": members, "crc32": _sum(members)}
+
+
+def _sum(members: Any) -> int:
+    """By which a damaged chunk is known, whatever the damage."""
+    return zlib.crc32(json.dumps(members).encode())
 
 
 def finished(folder: Path, unreadable: Callable[[Path], None] = lambda path: None) -> dict[int, Result]:
@@ -231,16 +240,17 @@ def finished(folder: Path, unreadable: Callable[[Path], None] = lambda path: Non
     for path in sorted(folder.glob("*.json")):
         try:
             results |= _recorded(path)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
             unreadable(path)
     return results
 
 
 def _recorded(path: Path) -> dict[int, Result]:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    if data["crc32"] != _sum(data["members"]):
+        raise ValueError("damaged")
     found = {}
-    for index, kept in json.loads(path.read_text(encoding="utf-8"))["members"].items():
+    for index, kept in data["members"].items():
         rows = [{k: float(v) if isinstance(v, str) else v for k, v in row.items()} for row in kept["rows"]]
-        if not rows:
-            raise ValueError("no report")
         found[int(index)] = Result(rows, kept["diverged"])
     return found

@@ -94,7 +94,7 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
     for indices in grid.groups():
         first = grid.points[indices[0]]
         env = request.environment(first.task)
-        request.check(env, first.learner)
+        request.check(env, first.learner, f"{path}: at {grids.said(first.place)}")
         points = {i: point(request.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
         members = [
             Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
