@@ -162,6 +162,7 @@ def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert "not a run folder" in complaint(capsys, "evaluate", tmp_path)
 
 
+@pytest.mark.usefixtures("quick_compilation")
 def test_foreign_environment_trains(tmp_path: Path) -> None:
     """Our learner on one of Brax's own environments, which measures no success."""
     assert qrl("train", "inverted_pendulum", "--out", tmp_path / "run", "--episode-steps", "20", *TINY.split()) == 0
