@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export sweep tasks test smoke lint FORCE
+.PHONY: help setup train evaluate export sweep tasks test smoke lint torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -24,9 +24,10 @@ define HELP
   make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
-  make test                          the tests (ARGS="-k vtrace": any flag of pytest)
+  make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright
+  make torture                       the long fault and fuzz campaign, and the tests with the newest versions
 
 TASK is a name or a path to a .json. `make setup PYTHON=python3.12` picks the interpreter.
 endef
@@ -64,11 +65,18 @@ sweep: $(STAMP)
 tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)
 
+# Two processes: on the two cores that the ten minutes are promised for. Each is handed one half of the tests in
+# their order, so what a module's tests share is made once, and at the end takes from the other's.
+WORKERS := -n 2 --dist worksteal
+
 test: $(STAMP)
-	@exec $(VENV)/bin/python -m pytest $(ARGS)
+	@exec $(VENV)/bin/python -m pytest $(WORKERS) $(ARGS)
 
 smoke: $(STAMP)
 	@exec tests/smoke.sh
+
+torture: $(STAMP)
+	@exec tests/torture.sh
 
 lint: $(STAMP)
 	@$(VENV)/bin/ruff check .

@@ -1,6 +1,7 @@
 """What tests share: programs of one shape are compiled once in a session, machines to run kernels on, a tiny run."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is loaded; as the command line does
@@ -23,9 +24,24 @@ settings.load_profile("default")
 
 @pytest.fixture(scope="session", autouse=True)
 def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path_factory.mktemp("xla")))
+    """One for each worker of pytest-xdist: JAX writes its entries in place, so another might read half of one."""
+    folder = str(tmp_path_factory.mktemp("xla"))
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder  # for the command line, here or in a process of its own
+    jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _quickly() -> Iterator[None]:
+    """For what runs for milliseconds: XLA's optimisations would take twice the time of the rest."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
+quick_compilation = pytest.fixture(_quickly)
+quick_compilation_of_module = pytest.fixture(scope="module")(_quickly)
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """The tasks as Brax environments: through Brax's own registry, wrappers and PPO."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,20 +17,13 @@ import qrl_envs
 from qrl_envs import env, quadrotor, task
 from qrl_envs.env import Lane, TaskEnv
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 Array = np.ndarray
 
 LANES = 6
 BRAXS_OWN = ("steps", "truncation", "episode_done", "episode_metrics", "first_")
 SIZES = {"hover": (18, 4), "circle": (18, 4), "pendulum": (3, 1)}
-
-
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation() -> Iterator[None]:
-    """What is compiled here runs for milliseconds: XLA's optimisations would take twice the time of the rest."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 class World(NamedTuple):

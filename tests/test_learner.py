@@ -12,6 +12,8 @@ from qrl.networks import log_density
 from qrl.types import Transition
 from qrl.vtrace import vtrace
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 B, T, F, A = 3, 7, 5, 2
 
 
@@ -107,7 +109,7 @@ def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
     """Targets and advantages are constants: scaling rewards by −1 leaves the critic's own pull, not a mixed one."""
     learner = Learner(config(normalise_advantage=False), F, A)
     state, data = learner.init(jax.random.PRNGKey(1)), batch()
-    gradient = jax.grad(lambda p: learner._loss(p, state, data)[0])(state.params)
+    gradient = jax.jit(jax.grad(lambda p: learner._loss(p, state, data)[0]))(state.params)
 
     def critic_only(critic: object) -> jax.Array:
         target = jax.lax.stop_gradient
@@ -119,7 +121,7 @@ def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
         _, v_trace = _traces(learner, state, data)
         return jnp.mean((value - target(v_trace)) ** 2) + 0.0 * terms.value
 
-    expected = jax.grad(critic_only)(state.params.critic)
+    expected = jax.jit(jax.grad(critic_only))(state.params.critic)
     jax.tree.map(lambda g, e: np.testing.assert_allclose(g, e, atol=1e-5), gradient.critic, expected)
 
 

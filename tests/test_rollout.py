@@ -1,7 +1,7 @@
 """The rollout against a literal loop over one lane's steps, on a toy whose observation is its whole state."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -16,6 +16,8 @@ from qrl.rollout import Lanes
 from qrl.types import Transition
 from qrl_envs import env as worlds
 from qrl_envs import task
+
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
 Array = np.ndarray
 
@@ -78,15 +80,6 @@ class Flight(NamedTuple):
     begun: Lanes
     ended: Lanes
     steps: Transition  # [N, UNROLLS·T, ...] NumPy
-
-
-@pytest.fixture(autouse=True, scope="module")
-def quick_compilation() -> Iterator[None]:
-    """What is compiled here runs for milliseconds: XLA's optimisations would take twice the time of the rest."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @functools.cache
