@@ -127,6 +127,17 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, who
         assert metrics(folder) == metrics(single)
 
 
+@pytest.mark.usefixtures("quick_compilation")
+@pytest.mark.parametrize("task", ["pendulum", "hover", "circle"])
+def test_the_same_seed_gives_the_same_bits_twice(tmp_path: Path, task: str) -> None:
+    """State, ring, lanes and metrics."""
+    env, run = worlds.make(task), run_config(steps=400)
+    for name in ("first", "again"):
+        train(tmp_path / name, run, env)
+    assert_same(last_state(tmp_path / "first", run, env), last_state(tmp_path / "again", run, env))
+    assert metrics(tmp_path / "first") == metrics(tmp_path / "again")
+
+
 class Poisoned(Env):
     """Counts steps; from step `bad` on the reward is not a number."""
 

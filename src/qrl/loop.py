@@ -114,6 +114,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
         if begin:
             empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
             states = trainer.place(peers.firsts(found.states if folders else empty))
+            clock = Clock(*map(float, peers.firsts(np.array(clock))))  # the same on all: they have to save together
         yield GoingOn(begin, found.notes)
     if not begin:
         yield Compiling("first state")
