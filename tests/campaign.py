@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import functools
 import hashlib
 import os
 import random
@@ -29,9 +28,9 @@ PATIENCE = 400.0  # seconds: whatever takes longer hangs
 SIZES = (
     "--lanes 16 --unroll-steps 20 --ring-unrolls 4 --warmup-unrolls 2 --updates-per-unroll 4 --minibatch-lanes 8"
     " --policy-hidden [8] --critic-hidden [8] --reports 12 --report-flights 4 --steps 7.68e4"
-).split()
+)
 STEPS, REPORTS = 76_800, 12
-TRAIN = ["train", "pendulum", *SIZES]
+TRAIN = ["train", "pendulum", *SIZES.split()]
 
 
 class Ended(NamedTuple):
@@ -88,7 +87,8 @@ def metrics(folder: Path) -> list[dict[str, str]]:
     """metrics.csv without its clocks."""
     with (folder / "metrics.csv").open(newline="") as file:
         return [
-            {k: v for k, v in row.items() if not k.endswith(("_seconds", "_per_second"))} for row in csv.DictReader(file)
+            {k: v for k, v in row.items() if not k.endswith(("_seconds", "_per_second"))}
+            for row in csv.DictReader(file)
         ]
 
 
@@ -122,12 +122,16 @@ def digest(folder: Path) -> dict[str, str]:
     }
 
 
-@functools.cache
 def whole_run(factory: pytest.TempPathFactory) -> Path:
     """A run never stopped, once for all tests."""
-    out = factory.mktemp("whole") / "run"
-    done(qrl(*TRAIN, "--out", out))
-    return out
+    if not _whole:
+        out = factory.mktemp("whole") / "run"
+        done(qrl(*TRAIN, "--out", out))
+        _whole.append(out)
+    return _whole[0]
+
+
+_whole: list[Path] = []
 
 
 def unfinished(whole: Path, to: Path, env_steps: int) -> Path:
@@ -206,6 +210,14 @@ class Disk(NamedTuple):
 
     def remount(self, options: str) -> None:
         subprocess.run([*self.inside, "mount", "-o", f"remount,{options}", str(self.path)], check=True)
+
+    def read_only(self, name: str, *, undo: bool = False) -> None:
+        """This folder, for whoever opens something in it from now on; no matter what is open already."""
+        folder = str(self.path / name)
+        again = [["umount", "-l", folder]]
+        bind = [["mount", "--bind", folder, folder], ["mount", "-o", "remount,bind,ro", folder]]
+        for words in again if undo else bind:
+            subprocess.run([*self.inside, *words], check=True)
 
     def fill(self) -> None:
         """Not a byte is left."""

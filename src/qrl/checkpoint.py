@@ -107,7 +107,7 @@ def _checked(path: Path) -> Record:
     except (OSError, ValueError, RecursionError) as error:
         raise Damaged(f"{path}/{SEAL}: cannot be read ({_first(error)})") from None
     if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found > FORMAT:
-        raise Foreign(f"{path}: of a later version of qrl (format {found}; this one reads {FORMAT})")
+        raise Foreign(f"{path}: of a later version of qrl (format {str(found)[:20]}; this one reads {FORMAT})")
     try:
         seal = _Seal.model_validate_json(text)
     except ValidationError as error:
@@ -212,7 +212,9 @@ class Writer:
     def _best(self, among: Sequence[int]) -> int:
         """Of these steps the one whose report was best; the first, where none had a report."""
         reports = {row["env_steps"]: row for row in self._rows}
-        ranks = {step: (_number(row["success"]), _number(row["return_mean"])) for step in among if (row := reports.get(step))}
+        ranks = {
+            step: (_number(row["success"]), _number(row["return_mean"])) for step in among if (row := reports.get(step))
+        }
         return max(ranks, key=lambda step: ranks[step], default=among[0])
 
 
@@ -233,7 +235,7 @@ def _root(folder: Path) -> Path:
 
 
 def _make_sure_of_room(path: Path, state_bytes: int) -> None:
-    """OSError where a state of so many bytes has no room: Orbax out of room half-way fills the screen with tracebacks."""
+    """OSError where such a state has no room: Orbax, out of room half-way, fills the screen with tracebacks."""
     room = path.with_name(ROOM)
     try:
         with room.open("wb") as file:
