@@ -54,6 +54,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "sweep": 3,
         "sweep_plot": 3,
         "runs": 3,
+        "tensorboard": 3,
         "plots": 3,
         "exits": 4,
         "request": 4,

@@ -7,6 +7,8 @@ was killed, and counts for nothing.
 
 import hashlib
 import json
+import math
+import os
 import shutil
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -25,6 +27,7 @@ from qrl.runs import Row, replace_text
 KEEP = 5  # the last so many, and the best
 FORMAT: Literal[1] = 1
 SEAL = "seal.json"
+ROOM = "room.tmp"
 STATE = "state"
 # Whoever calls Orbax does so alone: it must not wait for other processes of the run.
 _ONE_PROCESS = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0}, barrier_sync_key_prefix="qrl")
@@ -104,7 +107,7 @@ def _checked(path: Path) -> Record:
     except (OSError, ValueError, RecursionError) as error:
         raise Damaged(f"{path}/{SEAL}: cannot be read ({_first(error)})") from None
     if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found > FORMAT:
-        raise Foreign(f"{path}: of a later version of qrl (format {found}; this one reads {FORMAT})")
+        raise Foreign(f"{path}: of a later version of qrl (format {str(found)[:20]}; this one reads {FORMAT})")
     try:
         seal = _Seal.model_validate_json(text)
     except ValidationError as error:
@@ -114,7 +117,7 @@ def _checked(path: Path) -> Record:
     found = set(_files(path))
     for name, digest in seal.sha256.items():
         if name not in found:
-            raise Damaged(f"{path}/{name}: is missing")
+            raise Damaged(f"{path}: {json.dumps(name)[:120]} is missing")
         try:
             same = _sha256(path / name) == digest
         except OSError as error:
@@ -148,6 +151,9 @@ class Writer:
         self._thread = ThreadPoolExecutor(1, "checkpoint")
         self._pending: Future[None] | None = None
         _root(folder).mkdir(exist_ok=True)
+        for unfinished in _root(folder).glob("*.orbax-checkpoint-tmp*"):  # by a process that was killed
+            shutil.rmtree(unfinished)
+        (_root(folder) / ROOM).unlink(missing_ok=True)
         self._orbax = ocp.CheckpointManager(
             _root(folder).resolve(),
             options=ocp.CheckpointManagerOptions(
@@ -188,6 +194,7 @@ class Writer:
         try:
             # In NumPy once more: Brax's counters turn their parts into device arrays whenever they are put together.
             state = {name: np.asarray(leaf) for name, leaf in _by_name(checkpoint.state).items()}
+            _make_sure_of_room(path, sum(leaf.nbytes for leaf in state.values()))
             self._orbax.save(
                 checkpoint.env_steps,
                 args=ocp.args.Composite(**{STATE: ocp.args.StandardSave(state)}),
@@ -205,7 +212,9 @@ class Writer:
     def _best(self, among: Sequence[int]) -> int:
         """Of these steps the one whose report was best; the first, where none had a report."""
         reports = {row["env_steps"]: row for row in self._rows}
-        ranks = {step: (max(row["success"], 0.0), row["return_mean"]) for step in among if (row := reports.get(step))}
+        ranks = {
+            step: (_number(row["success"]), _number(row["return_mean"])) for step in among if (row := reports.get(step))
+        }
         return max(ranks, key=lambda step: ranks[step], default=among[0])
 
 
@@ -223,6 +232,22 @@ class _Preserve(policies.PreservationPolicy):
 
 def _root(folder: Path) -> Path:
     return folder / "checkpoints"
+
+
+def _make_sure_of_room(path: Path, state_bytes: int) -> None:
+    """OSError where such a state has no room: Orbax, out of room half-way, fills the screen with tracebacks."""
+    room = path.with_name(ROOM)
+    try:
+        with room.open("wb") as file:
+            if hasattr(os, "posix_fallocate"):
+                os.posix_fallocate(file.fileno(), 0, state_bytes * 5 // 4 + 2**20)  # and what Orbax notes beside it
+    finally:
+        room.unlink(missing_ok=True)
+
+
+def _number(value: float) -> float:
+    """For comparisons, in which NaN (not measured) has no place."""
+    return float("-inf") if math.isnan(value) else value
 
 
 def _is_step(path: Path) -> bool:
@@ -243,4 +268,5 @@ def _record_sha256(record: Record) -> str:
 
 
 def _first(error: Exception) -> str:
-    return str(error).strip().split("\n")[0][:120]
+    text = (isinstance(error, OSError) and error.strerror) or str(error).strip()
+    return text.split("\n")[0][:120]

@@ -163,8 +163,10 @@ def _value(text: str) -> Any:
 
 
 def _prepare(out: Path, config: RunConfig, held: bool) -> None:
+    runs.tidy(out)
     for i, folder in enumerate(runs.members(out, config)):
         folder.mkdir(parents=True, exist_ok=True)
+        runs.tidy(folder)
         if not held:
             runs.write_json(folder / "config.json", config.member(i).model_dump(mode="json"))
     if not held:
@@ -188,7 +190,8 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
             elif isinstance(event, loop.GoingOn):
                 for note in event.notes:
                     complain(f"warning: {note}")
-                console.print(f"going on from step {event.env_steps:,}")
+                whence = f"step {event.env_steps:,}" if event.env_steps else "the start: no checkpoint is whole"
+                console.print(f"going on from {whence}")
             elif isinstance(event, loop.Progress):
                 note = f"{event.steps_per_second:,.0f} steps/s, {clock(event.seconds_left)} left"
                 bar.update(task, completed=event.env_steps, note=note)
@@ -227,13 +230,16 @@ def _finish(out: Path, config: RunConfig, flights: Flights, seconds: float) -> N
     history = [runs.read_metrics(folder) for folder in folders]
     for i, folder in enumerate(folders):
         title = f"{config.task.name}, seed {config.seed + i}"
-        plots.learning_curve(folder / "learning_curve.png", [history[i]], title)
+        with runs.writing(folder / "learning_curve.png"):
+            plots.learning_curve(folder / "learning_curve.png", [history[i]], title)
         if config.task.spec:
             shown = np.asarray(flights.observations[i, :PICTURE_FLIGHTS])
-            picture.flights(folder / "flight.png", _task(config), shown)
+            with runs.writing(folder / "flight.png"):
+                picture.flights(folder / "flight.png", _task(config), shown)
         runs.write_json(folder / "summary.json", {"result": history[i][-1], "command_seconds": round(seconds, 1)})
     if len(folders) > 1:
-        plots.learning_curve(out / "learning_curve.png", history, f"{config.task.name}, {len(folders)} seeds")
+        with runs.writing(out / "learning_curve.png"):
+            plots.learning_curve(out / "learning_curve.png", history, f"{config.task.name}, {len(folders)} seeds")
         last = [rows[-1] for rows in history]
         spread = {
             name: {"median": float(np.median(v)), "min": float(np.min(v)), "max": float(np.max(v))}

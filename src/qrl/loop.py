@@ -8,13 +8,13 @@ from typing import Any
 import jax
 import numpy as np
 from brax.envs.base import Env
-from tensorboardX import SummaryWriter
 
 from qrl import checkpoint, peers, restore, runs
 from qrl.checkpoint import Checkpoint, Record
 from qrl.evaluate import Flights
 from qrl.laps import Clock, Lap, Programs, compile_advance, compile_fly, laps, report_starts, seeds
 from qrl.runs import Row, RunConfig
+from qrl.tensorboard import EventLog
 from qrl.train import Trainer, point, spread, stack
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
@@ -73,17 +73,14 @@ class Member:
         self.folder = folder
         self.rows = rows
         self.checkpoints = checkpoint.Writer(folder)
-        self._tensorboard = SummaryWriter(str(folder / "tensorboard"), purge_step=env_steps + 1)
+        self._tensorboard = EventLog(folder / "tensorboard", purge_step=env_steps + 1)
         if rows:
             runs.write_metrics(folder, rows)  # those after the checkpoint are cut
 
     def record(self, row: Row) -> None:
         self.rows.append(row)
         runs.write_metrics(self.folder, self.rows)
-        for name, value in row.items():
-            if name != "env_steps" and np.isfinite(value):
-                self._tensorboard.add_scalar(name, value, int(row["env_steps"]))
-        self._tensorboard.flush()
+        self._tensorboard.add(row)
 
     def save(self, env_steps: int, state: Any, clock: Clock) -> None:
         self.checkpoints.save(Checkpoint(env_steps, state, Record(rows=list(self.rows), **clock._asdict())))

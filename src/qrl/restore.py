@@ -45,6 +45,8 @@ def latest(folders: list[Path], like: TrainState) -> Restored:
         env_steps, found = 0, []
     for folder in folders:
         checkpoint.clear_after(folder, env_steps)
+    whence = f"going on from the checkpoint at step {env_steps:,}" if env_steps else "starting afresh: none is whole"
+    notes = [f"{note}; {whence}" for note in notes]
     states = stack([each.state for each in found]) if found else None
     return Restored(env_steps, states, [each.record for each in found], notes)
 

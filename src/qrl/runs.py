@@ -6,6 +6,8 @@ import json
 import math
 import os
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any, Literal
@@ -106,11 +108,31 @@ def write_json(path: Path, data: Any) -> None:
 def replace_text(path: Path, text: str) -> None:
     """Write a file under another name and rename it: whoever reads sees the old one or the new one, whole."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # nobody else's, should two write the same file
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())  # a name that outlives a crash must not point at what did not
-    temporary.replace(path)
+    with writing(path):
+        try:
+            with temporary.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())  # a name that outlives a crash must not point at what did not
+            temporary.replace(path)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """While `path` is written: an OSError's message names it, whatever the system calls it."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def tidy(folder: Path) -> None:
+    """Remove what a killed process left of files that it was writing; for who alone writes in this folder."""
+    for temporary in folder.glob("*.[0-9]*.tmp"):
+        temporary.unlink(missing_ok=True)
 
 
 def _plain(data: Any) -> Any:

@@ -1,0 +1,571 @@
+"""Whatever happens to disk, folder or checkpoints: it is said in one line, and nothing already saved is harmed."""
+
+import functools
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from brax.envs.base import Env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import campaign
+from campaign import REPORTS, STEPS, TORTURE, TRAIN, Ended
+from frontdoor import qrl
+from qrl import checkpoint, laps, processes, restore
+from qrl.checkpoint import Checkpoint, Damaged, Foreign, Record
+from qrl.train import Trainer, TrainState, point, stack
+from qrl_envs import env as worlds
+from test_loop import run_config, train
+
+FAULTS: list[str] = []  # injected so far
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _count(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    campaign.tell(request, f"{len(FAULTS)} faults, 0 lost updates")
+
+
+@pytest.fixture(scope="module")
+def pendulum() -> Env:
+    return worlds.make("pendulum")
+
+
+@pytest.fixture(scope="module")
+def like(pendulum: Env) -> TrainState:
+    """Shapes and types of the state of a run of one seed."""
+    learner = run_config().learner
+    return restore.shapes(Trainer(pendulum, learner), stack([point(pendulum, learner)]))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory, pendulum: Env) -> Path:
+    """A run with checkpoints at 200, 400 … 1200 (one of them goes, unless it is the best)."""
+    out = tmp_path_factory.mktemp("small") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(laps, "CHUNK_SECONDS", 1e-4)
+        train(out, run_config(), pendulum)
+    return out
+
+
+def copy(run: Path, to: Path) -> Path:
+    shutil.rmtree(to, ignore_errors=True)
+    return shutil.copytree(run, to)
+
+
+def newest(run: Path) -> Path:
+    return run / "checkpoints" / str(checkpoint.steps(run)[0])
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+# -- damage --------------------------------------------------------------------------------------------------
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def replace_by_a_directory(path: Path) -> None:
+    path.unlink()
+    path.mkdir()
+
+
+DAMAGE: list[Callable[[Path], None]] = [truncate, flip, empty, Path.unlink, replace_by_a_directory]
+
+
+def does_nothing(how: Callable[[Path], None], path: Path) -> bool:
+    """Some of Orbax's files are empty."""
+    return path.stat().st_size == 0 and how in (truncate, flip, empty)
+
+
+_READ: dict[tuple[Path, int], Checkpoint] = {}
+
+
+def assert_restores(run: Path, env_steps: int, like: TrainState, small: Path) -> list[str]:
+    """`latest` gives this checkpoint, equal to what the whole run holds; its notes."""
+    found = restore.latest([run], like)
+    assert found.env_steps == env_steps
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
+    wanted = checkpoint.read(small, env_steps, one) if (small, env_steps) not in _READ else _READ[small, env_steps]
+    _READ[small, env_steps] = wanted
+    for a, b in zip(jax.tree.leaves(found.states), jax.tree.leaves(wanted.state), strict=True):
+        np.testing.assert_array_equal(a[0], b)
+    assert found.records == [wanted.record]
+    return found.notes
+
+
+@pytest.mark.parametrize("how", DAMAGE, ids=lambda how: how.__name__)
+def test_damaged_checkpoint_is_found_and_the_one_before_used(
+    tmp_path: Path, small: Path, like: TrainState, how: Callable[[Path], None]
+) -> None:
+    """Every file of the newest one: named in a note, the rest set aside as it is, the one before restored."""
+    last, before = checkpoint.steps(small)[:2]
+    names = files(newest(small))
+    for name in names if TORTURE else {*names[DAMAGE.index(how) :: 4], checkpoint.SEAL}:
+        run = copy(small, tmp_path / "run")
+        victim = newest(run) / name
+        if does_nothing(how, victim):
+            continue
+        how(victim)
+        FAULTS.append(f"{how.__name__} {name}")
+        left = campaign.digest(newest(run)) if name != checkpoint.SEAL or how != Path.unlink else None
+        notes = assert_restores(run, before, like, small)
+        assert str(last) not in [path.name for path in (run / "checkpoints").iterdir()]
+        if left is not None:  # what has no seal counts for nothing, and needs no word
+            assert len(notes) == 1
+            assert f"checkpoints/{last}" in notes[0]
+            assert Path(name).name in notes[0]
+            assert f"going on from the checkpoint at step {before:,}" in notes[0]
+            assert campaign.digest(run / "checkpoints" / f"aside-{last}") == left
+        if TORTURE:
+            assert assert_restores(run, before, like, small) == []  # and once more: nothing is left to say
+
+
+def test_all_damaged_starts_afresh(tmp_path: Path, small: Path, like: TrainState) -> None:
+    """It is said of each, and what there is stays, set aside."""
+    run = copy(small, tmp_path / "run")
+    for i, env_steps in enumerate(checkpoint.steps(run)):
+        DAMAGE[i % 3](run / "checkpoints" / str(env_steps) / checkpoint.SEAL)
+        FAULTS.append(f"all damaged: {env_steps}")
+    found = restore.latest([run], like)
+    assert (found.env_steps, found.states, found.records) == (0, None, [])
+    assert len(found.notes) == len(checkpoint.steps(small))
+    assert all("starting afresh" in note for note in found.notes)
+    aside = {path.name for path in (run / "checkpoints").iterdir()}
+    assert aside == {f"aside-{env_steps}" for env_steps in checkpoint.steps(small)}
+
+
+def test_newest_step_that_is_whole_for_all_seeds_is_used(tmp_path: Path, small: Path, like: TrainState) -> None:
+    """One seed lacks the last, the other's last but one is damaged: both go on from the one before these."""
+    first, second = copy(small, tmp_path / "first"), copy(small, tmp_path / "second")
+    last, other, both = checkpoint.steps(small)[:3]
+    (first / "checkpoints" / str(last) / checkpoint.SEAL).unlink()
+    flip(second / "checkpoints" / str(other) / checkpoint.SEAL)
+    FAULTS.extend(["no seal of one seed", "damage of the other"])
+    pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype), like)
+    found = restore.latest([first, second], pair)
+    assert found.env_steps == both
+    assert len(found.notes) == 1
+    assert str(second) in found.notes[0]
+    assert [len(record.rows) for record in found.records] == [both // 200] * 2
+    assert checkpoint.steps(first)[0] == checkpoint.steps(second)[0] == both
+
+
+def test_killed_while_a_checkpoint_is_removed(tmp_path: Path, small: Path, like: TrainState) -> None:
+    """Any number of its files are gone, the seal first or not: it is passed over."""
+    before = checkpoint.steps(small)[1]
+    names = [checkpoint.SEAL, *[name for name in files(newest(small)) if name != checkpoint.SEAL]]
+    for order in (names, names[::-1]):
+        for count in range(1, len(names) + 1, 1 if TORTURE else 3):
+            run = copy(small, tmp_path / "run")
+            last = newest(run)
+            for name in order[:count]:
+                (last / name).unlink()
+            FAULTS.append(f"{count} files removed")
+            assert_restores(run, before, like, small)
+
+
+def save(folder: Path, writer: checkpoint.Writer, rows: list[dict[str, float | int]]) -> None:
+    state = {"step": np.int32(rows[-1]["env_steps"])}
+    writer.save(Checkpoint(int(rows[-1]["env_steps"]), state, Record(rows=rows, train_seconds=0, report_seconds=0)))
+    writer.wait()
+
+
+@pytest.mark.parametrize("resume_after", [0, 4, 8])
+@pytest.mark.parametrize(
+    ("reports", "best"),
+    [
+        ([(0.0, -9), (0.5, -5), (0.5, -4), (0.4, -1), (0, 0), (0, 0), (0, 0), (0, 0), (0, 0), (0, 0)], 3),
+        ([(np.nan, r) for r in (-9, -1, -8, -7, -6, -5, -5, -4, -3, -2)], 2),  # a foreign world: no success
+        ([(0.0, np.nan), (0.0, -3), *[(0.0, np.nan)] * 8], 2),
+    ],
+    ids=["success, then return", "return alone", "no number is the worst"],
+)
+def test_the_last_five_and_the_best_are_kept(
+    tmp_path: Path, reports: list[tuple[float, float]], best: int, resume_after: int
+) -> None:
+    """A resume forgets none of it."""
+    rows: list[dict[str, float | int]] = []
+    writer = checkpoint.Writer(tmp_path)
+    for i, (success, value) in enumerate(reports, start=1):
+        rows.append({"env_steps": i, "success": success, "return_mean": value})
+        save(tmp_path, writer, rows)
+        if i == resume_after:
+            writer.close()
+            found = checkpoint.read(tmp_path, i, {"step": jax.ShapeDtypeStruct((), np.int32)})
+            rows = list(found.record.rows)
+            writer = checkpoint.Writer(tmp_path)
+    writer.close()
+    assert checkpoint.steps(tmp_path) == [10, 9, 8, 7, 6, best]
+
+
+# -- fuzz ----------------------------------------------------------------------------------------------------
+
+NASTY = st.sampled_from(
+    ["", "../../../../etc/passwd", "/etc/passwd", "..", ".", "state", "a\nb", "a\0b", "\ud800", "x" * 5000, "nan"]
+)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | NASTY | st.just(10**400),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text() | NASTY, inner, max_size=4),
+    max_leaves=8,
+)
+
+
+@pytest.fixture(scope="module")
+def victim(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sealed checkpoint at step 7."""
+    folder = tmp_path_factory.mktemp("victim")
+    writer = checkpoint.Writer(folder)
+    state = {"weights": np.arange(6, dtype=np.float32).reshape(2, 3), "step": np.int32(7)}
+    rows: list[dict[str, float | int]] = [{"env_steps": 7, "success": float("nan"), "return_mean": -1.5}]
+    writer.save(Checkpoint(7, state, Record(rows=rows, train_seconds=1.25, report_seconds=0.5)))
+    writer.wait()
+    writer.close()
+    return folder
+
+
+LIKE = {"weights": jax.ShapeDtypeStruct((2, 3), np.float32), "step": jax.ShapeDtypeStruct((), np.int32)}
+
+
+def read_or_complaint(folder: Path) -> Checkpoint | str:
+    try:
+        return checkpoint.read(folder, 7, LIKE)
+    except (Damaged, Foreign) as error:
+        return str(error)
+
+
+def read_cleanly(folder: Path) -> bool:
+    """Whether the checkpoint can be read; it is then what was saved, and otherwise one line says what is wrong."""
+    found = read_or_complaint(folder)
+    if isinstance(found, str):
+        assert "\n" not in found
+        assert len(found) < len(str(folder)) + 300
+        assert found.startswith(str(folder / "checkpoints" / "7"))
+        return False
+    np.testing.assert_array_equal(found.state["weights"], np.arange(6).reshape(2, 3))
+    assert found.state["step"] == 7
+    assert found.record.rows[0]["return_mean"] == -1.5
+    assert (found.record.train_seconds, found.record.report_seconds) == (1.25, 0.5)
+    return True
+
+
+def places(data: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    """Every place in a JSON value."""
+    inner = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list) else ()
+    return [at, *[place for key, value in inner for place in places(value, (*at, key))]]
+
+
+def put(data: Any, at: tuple[Any, ...], value: Any) -> Any:
+    if not at:
+        return value
+    data[at[0]] = put(data[at[0]], at[1:], value)
+    return data
+
+
+@functools.cache
+def sealed(victim: Path) -> bytes:
+    return (victim / "checkpoints" / "7" / checkpoint.SEAL).read_bytes()
+
+
+def with_seal(victim: Path, data: bytes) -> bool:
+    path = victim / "checkpoints" / "7" / checkpoint.SEAL
+    original = sealed(victim)
+    path.write_bytes(data)
+    FAULTS.append("seal")
+    try:
+        return read_cleanly(victim)
+    finally:
+        path.write_bytes(original)
+
+
+def mutated(draw: st.DrawFn, data: bytes) -> bytes:
+    """Some bytes changed, left out or put in, or an end cut off."""
+    for _ in range(draw(st.integers(1, 3))):
+        at = draw(st.integers(0, max(len(data) - 1, 0)))
+        out = draw(st.integers(0, 4) | st.just(len(data)))
+        data = data[:at] + draw(st.binary(max_size=4)) + data[at + out :]
+    return data
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_seal_of_other_bytes(victim: Path, data: st.DataObject) -> None:
+    """Changed anywhere, it is refused in one line, or reads as what was saved."""
+    with_seal(victim, mutated(data.draw, sealed(victim)))
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_seal_of_other_json(victim: Path, data: st.DataObject) -> None:
+    """Any JSON in any place of it: refused in one line, or no change at all."""
+    seal = json.loads(sealed(victim))
+    at = data.draw(st.sampled_from(places(seal)))
+    text = json.dumps(put(seal, at, data.draw(JSON)))
+    if data.draw(st.booleans()):
+        seal = put(seal, at, {**seal, data.draw(NASTY): 1} if not at else data.draw(NASTY))
+        text = json.dumps(seal)
+    with_seal(victim, text.encode())
+
+
+@settings(deadline=None)
+@given(st.one_of(st.text() | NASTY, st.sampled_from([*files(Path(__file__).parent)[:1], "state/_METADATA"])))
+def test_seal_that_names_other_files(victim: Path, name: str) -> None:
+    """A path that leads out of the checkpoint is not followed."""
+    seal = json.loads(sealed(victim))
+    seal["sha256"][name] = "0" * 64
+    assert not with_seal(victim, json.dumps(seal).encode())
+
+
+@settings(deadline=None)
+@given(st.one_of(st.integers(), st.integers(2), st.floats(), st.booleans(), st.sampled_from([10**4299, 1e400])))
+def test_seal_of_another_format(victim: Path, number: float) -> None:
+    """A later one is said to be later."""
+    seal = json.loads(sealed(victim))
+    seal["format"] = number
+    assert with_seal(victim, json.dumps(seal).encode()) == (type(number) in (int, float, bool) and number == 1)
+
+
+@pytest.mark.parametrize("depth", [10, 1_000, 100_000])
+@pytest.mark.parametrize("begin", ["[", '{"a":', '{"format":1,"record":[', '{"format":1,"sha256":{"a":['])
+def test_seal_of_great_depth(victim: Path, depth: int, begin: str) -> None:
+    assert not with_seal(victim, (begin * depth).encode())
+
+
+@settings(deadline=None)
+@given(st.data())
+def test_other_files_of_other_bytes(victim: Path, data: st.DataObject) -> None:
+    """Not one of them reaches Orbax."""
+    path = victim / "checkpoints" / "7"
+    name = data.draw(st.sampled_from([name for name in files(path) if name != checkpoint.SEAL]))
+    original = (path / name).read_bytes()
+    changed = mutated(data.draw, original)
+    (path / name).write_bytes(changed)
+    FAULTS.append(f"other bytes in {name}")
+    try:
+        assert read_cleanly(victim) == (changed == original)
+    finally:
+        (path / name).write_bytes(original)
+
+
+# -- the command line ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return campaign.whole_run(tmp_path_factory)
+
+
+LATE = STEPS * 9 // REPORTS  # of what is kept to the end, two are not later
+
+
+def refused(capfd: pytest.CaptureFixture[str], *words: str | Path) -> str:
+    """The one line of exit code 2; from a process of its own where all is run."""
+    if TORTURE:
+        return campaign.complaint(campaign.qrl(*words), 2)
+    capfd.readouterr()
+    code = qrl(*words)
+    captured = capfd.readouterr()
+    return campaign.complaint(Ended(code, captured.out, captured.err), 2)
+
+
+@pytest.fixture
+def stopped(tmp_path: Path, whole: Path) -> Path:
+    """A run that has come some way."""
+    return campaign.unfinished(whole, tmp_path / "stopped", LATE)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["hover"], "not the same task"),
+        (["pendulum", *TRAIN[2:], "--policy-hidden", "[16]"], "key 'learner.policy_hidden' is (8,), asked for (16,)"),
+        (["pendulum", "--seed", "7"], "key 'seed' is 0, found 7"),
+    ],
+    ids=["task", "network", "seed"],
+)
+def test_resume_of_something_else_touches_nothing(
+    capfd: pytest.CaptureFixture[str], stopped: Path, words: list[str], says: str
+) -> None:
+    before = campaign.digest(stopped)
+    FAULTS.append(says)
+    assert says in refused(capfd, "train", *words, "--out", stopped, "--resume")
+    assert campaign.digest(stopped) == before
+
+
+def test_checkpoint_of_a_later_format_touches_nothing(capfd: pytest.CaptureFixture[str], stopped: Path) -> None:
+    """This version must not read it, and must not take it for a damaged one either."""
+    seal = newest(stopped) / checkpoint.SEAL
+    data = json.loads(seal.read_text())
+    seal.write_text(json.dumps({**data, "format": checkpoint.FORMAT + 1, "more": []}))
+    before = campaign.digest(stopped)
+    FAULTS.append("later format")
+    assert "later version of qrl (format 2" in refused(capfd, *TRAIN, "--out", stopped, "--resume")
+    assert campaign.digest(stopped) == before
+
+
+def test_checkpoint_of_another_network_touches_nothing(
+    capfd: pytest.CaptureFixture[str], stopped: Path, small: Path
+) -> None:
+    """Whole, sealed, and of a run with other shapes."""
+    shutil.copytree(newest(small), stopped / "checkpoints" / str(STEPS))
+    before = campaign.digest(stopped)
+    FAULTS.append("checkpoint of another network")
+    assert "of another" in refused(capfd, *TRAIN, "--out", stopped, "--resume")
+    assert campaign.digest(stopped) == before
+
+
+def test_second_process_on_a_folder_is_refused(capfd: pytest.CaptureFixture[str], stopped: Path) -> None:
+    """While another holds the lock; with it gone, the folder can be had."""
+    before = campaign.digest(stopped)
+    FAULTS.append("second process")
+    with processes.locked(stopped / "lock", "busy"):
+        line = refused(capfd, *TRAIN, "--out", stopped, "--resume")
+    assert f"{stopped}: another process is at work in it" in line
+    assert campaign.digest(stopped) == before
+    with processes.locked(stopped / "lock", "busy"):
+        pass
+
+
+def goes_on(run: Path, whole: Path) -> None:
+    """Resumed, it ends as a run that never met the fault; in a process of its own where all is run."""
+    words = [*TRAIN, "--out", run, "--resume"]
+    if TORTURE:
+        campaign.done(campaign.qrl(*words))
+    else:
+        assert qrl(*words) == 0
+    campaign.assert_same_run(run, whole)
+
+
+def sealed_steps(folder: Path) -> int:
+    return len(checkpoint.steps(folder)) if (folder / "checkpoints").is_dir() else 0
+
+
+def test_full_disk_at_the_first_checkpoint(tmp_path: Path, whole: Path) -> None:
+    """One line and exit code 1; with more room the run goes on and ends as one that never met it."""
+    with campaign.small_disk(tmp_path / "disk", "1m") as disk:
+        words = [*TRAIN, "--out", disk.path / "run"]
+        FAULTS.append("disk full at the first checkpoint")
+        line = campaign.complaint(campaign.qrl(*words, inside=disk.inside), 1)
+        assert "the checkpoint could not be written (No space left on device)" in line
+        assert sealed_steps(disk.seen / "run") == 0
+        disk.remount("size=20m")
+        goes_on(disk.seen / "run", whole)
+
+
+@pytest.mark.parametrize("room", ["some", *(["none"] if TORTURE else [])])
+def test_full_disk_after_several_checkpoints(tmp_path: Path, whole: Path, room: str) -> None:
+    """Those that were made stay readable, and with more room the run goes on from the last of them."""
+    with campaign.small_disk(tmp_path / "disk", "20m") as disk:
+        run = campaign.unfinished(whole, disk.seen / "run", LATE)
+        before = {name: value for name, value in campaign.digest(run).items() if name.startswith("checkpoints/")}
+        disk.remount(f"size={used_kib(disk.seen) + 900}k")
+        words = [*TRAIN, "--out", disk.path / "run", "--resume"]
+        FAULTS.append(f"full disk, {room} left")
+        process = campaign.start(*words, inside=disk.inside)
+        if room == "none":
+            campaign.wait_for(process, lambda: len(list((run / "tensorboard").iterdir())) > 1)
+            disk.fill()
+        assert str(disk.path / "run") in campaign.complaint(campaign.end(process), 1)
+        left = campaign.digest(run)
+        assert before.items() <= left.items()
+        assert checkpoint.steps(run)[0] == LATE
+        disk.remount("size=40m")
+        goes_on(run, whole)
+
+
+def used_kib(path: Path) -> int:
+    at = os.statvfs(path)
+    return (at.f_blocks - at.f_bfree) * at.f_frsize // 1024
+
+
+@pytest.mark.skipif(not TORTURE, reason="part of make torture")
+@pytest.mark.parametrize("name", ["metrics.csv", "summary.json", "learning_curve.png", "flight.png", "tensorboard"])
+def test_file_that_cannot_be_written(tmp_path: Path, whole: Path, name: str) -> None:
+    """A directory is in its place: one line names it, and once it is gone the run ends as if it had never been."""
+    run = campaign.unfinished(whole, tmp_path / "run", LATE)
+    if name == "tensorboard":
+        shutil.rmtree(run / name)
+        (run / name).write_text("")
+    else:
+        (run / name).unlink(missing_ok=True)
+        (run / name / "inside").mkdir(parents=True)
+    FAULTS.append(f"{name} in the way")
+    words = [*TRAIN, "--out", run, "--resume"]
+    assert str(run / name) in campaign.complaint(campaign.qrl(*words), 1)
+    shutil.rmtree(run / name) if (run / name).is_dir() else (run / name).unlink()
+    goes_on(run, whole)
+
+
+SAVED = "checkpoints/"
+
+
+def saved(run: Path) -> dict[str, str]:
+    return {name: value for name, value in campaign.digest(run).items() if name.startswith(SAVED)}
+
+
+@pytest.mark.parametrize("when", ["before", *(["compiling", "training"] if TORTURE else [])])
+def test_folder_that_becomes_read_only(tmp_path: Path, whole: Path, when: str) -> None:
+    """One line names what could not be written; everything saved is as it was."""
+    with campaign.small_disk(tmp_path / "disk", "20m") as disk:
+        run = campaign.unfinished(whole, disk.seen / "run", LATE)
+        if when == "training":
+            checkpoint.clear_after(run, 0)
+        before = saved(run)
+        words = [*TRAIN, "--out", disk.path / "run", "--resume"]
+        FAULTS.append(f"read-only: {when}")
+        events = len(list((run / "tensorboard").iterdir()))
+        if when == "before":
+            disk.read_only("run")
+        process = campaign.start(*words, inside=disk.inside)
+        if when == "compiling":
+            campaign.wait_for(process, lambda: len(list((run / "tensorboard").iterdir())) > events)
+        if when == "training":
+            campaign.wait_for(process, lambda: sealed_steps(run) > 0)
+        if when != "before":
+            disk.read_only("run")
+        line = campaign.complaint(campaign.end(process), 1)
+        assert str(disk.path / "run") in line
+        assert "Read-only file system" in line
+        assert before.items() <= saved(run).items()
+        disk.read_only("run", undo=True)
+        goes_on(run, whole)
+
+
+@pytest.mark.parametrize("how", ["moved", *(["removed"] if TORTURE else [])])
+def test_folder_that_vanishes_while_training(tmp_path: Path, whole: Path, how: str) -> None:
+    """One line; it is not made anew. Moved back, the run goes on."""
+    run, away = tmp_path / "run", tmp_path / "away"
+    words = [*TRAIN, "--out", run, "--resume"]
+    process = campaign.start(*words)
+    campaign.wait_for(process, lambda: sealed_steps(run) > 0)
+    run.rename(away)
+    FAULTS.append(f"vanished: {how}")
+    kept = checkpoint.steps(away)
+    if how == "removed":
+        shutil.rmtree(away)
+    assert str(run) in campaign.complaint(campaign.end(process), 1)
+    assert not run.exists()
+    if how == "moved":
+        assert checkpoint.steps(away)[-len(kept) :] == kept
+        away.rename(run)
+    goes_on(run, whole)
