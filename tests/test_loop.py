@@ -12,6 +12,7 @@ from brax.envs.base import Env, State
 from qrl import checkpoint, laps, loop, restore, runs
 from qrl.config import Config
 from qrl.runs import RunConfig, TaskRecord
+from qrl.train import Trainer, point, stack
 from qrl_envs import env as worlds
 
 SMALL = {
@@ -107,6 +108,17 @@ def test_resumed_run_equals_one_never_stopped(tmp_path: Path, pendulum: Env, who
     train(tmp_path, run_config(), pendulum, resume=True)
     assert_same(last_state(tmp_path, run_config(), pendulum), last_state(whole, run_config(), pendulum))
     assert metrics(tmp_path) == metrics(whole)
+
+
+@pytest.mark.parametrize("task", ["pendulum", "hover"])
+def test_a_restored_state_runs_the_program_of_a_first_one(task: str) -> None:
+    """The same to the last letter: so a resumed run finds it compiled, and cannot differ by what XLA makes of it."""
+    env, config = worlds.make(task), run_config().learner
+    trainer, points = Trainer(env, config), stack([point(env, config)])
+    first = restore.shapes(trainer, points)
+    restored = trainer.place(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), first))
+    programs = [trainer.advance.lower(states, points, np.int32(0)).as_text() for states in (first, restored)]
+    assert programs[0] == programs[1]
 
 
 def test_rows_after_the_checkpoint_are_cut(tmp_path: Path, pendulum: Env, whole: Path) -> None:

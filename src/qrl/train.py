@@ -196,7 +196,9 @@ class Trainer:
         ring = buffer.create(transitions, self.config.ring_unrolls)
         zero = jnp.float32(0.0)
         totals = Totals(zero, zero, zero, zero, zero, Terms(*[zero] * len(Terms._fields)))
-        return TrainState(first, ring, lanes, key, starts, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
+        state = TrainState(first, ring, lanes, key, starts, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
+        # Types that are said, not weak: a restored state has no others, and would have a program of its own.
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
 
     def _collect(
         self, learner: Learner, state: LearnerState, lanes: Lanes, key: chex.PRNGKey, starts: chex.PRNGKey
