@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -166,38 +166,40 @@ def killed_again_and_again(
 ) -> int:
     """Start, kill at any moment, go on, until `kills` kills have happened; then to the end. How many did happen.
 
-    `seconds`: what a run takes about. A process that lives long enough for more than its share of checkpoints is
-    killed a moment later: otherwise a lucky one could finish before enough kills have happened. Where nothing is
-    reached for a while, the next may live longer.
+    `seconds`: what a run takes about. Where it has come further than its share of the kills, it dies young or soon
+    after another checkpoint: otherwise it could end before enough kills have happened. Where it comes no further, it
+    may live longer. The second kill falls between two checkpoints, the last between the last of them and the end.
     """
-    done_kills, span, share = 0, seconds, max(1, REPORTS // max(kills // 3, 1))
-    while done_kills < kills:
+    happened, span = 0, seconds
+    while happened < kills:
         before = [checkpoint.steps(folder)[:1] for folder in folders]
-        reached = before[0][0] if before[0] else 0
-        goal = reached + share * STEPS // REPORTS
-
-        def lucky(goal: int = goal) -> bool:
-            return any(step > goal for step in checkpoint.steps(folders[0])[:1])
-
+        reached = max((steps[0] for steps in before if steps), default=0)
         process = start(*words, **changes)
-        if wait_for(process, lucky, draw.uniform(0.0, span)) and lucky():
-            wait_for(process, lambda: False, draw.uniform(0.0, 0.3))
-        which = SIGNALS[done_kills % len(SIGNALS)]
-        came = process.poll() is None
-        if came:
+        if happened == kills - 1:
+            wait_for(process, lambda: (folders[0] / "checkpoints" / str(STEPS) / checkpoint.SEAL).exists())
+            wait_for(process, lambda: False, draw.uniform(0.0, 0.5))
+        else:
+            ahead = reached / STEPS > (happened + 1) / kills
+            moment = PATIENCE if happened == 1 else draw.uniform(0.0, seconds / 4 if ahead else span)
+            goal = reached + STEPS // REPORTS * max(1, REPORTS // kills - 1)
+            wait_for(process, lambda goal=goal: checkpoint.steps(folders[0])[:1] > [goal], moment)
+            wait_for(process, lambda: False, draw.uniform(0.0, 0.2))
+        which = SIGNALS[happened % len(SIGNALS)]
+        if process.poll() is None:
             process.send_signal(which)
         ended = end(process)
-        if not came or ended.code == 0:
+        if ended.code == 0:  # too late
             done(ended)
-            break  # all is done
-        done_kills += 1
+            break
+        happened += 1
         assert ended.code in (1, -which), (which, ended)
-        for folder, earlier in zip(folders, before, strict=True):
-            assert checkpoint.steps(folder)[:1] >= earlier, "a checkpoint is lost"
-        if [checkpoint.steps(folder)[:1] for folder in folders] == before:
+        assert "Traceback" not in ended.error, ended.error
+        after = [checkpoint.steps(folder)[:1] for folder in folders]
+        assert all(now >= earlier for now, earlier in zip(after, before, strict=True)), "a checkpoint is lost"
+        if after == before:
             span *= 1.1
     done(qrl(*words, **changes))
-    return done_kills
+    return happened
 
 
 # -- a small disk --------------------------------------------------------------------------------------------
@@ -262,6 +264,6 @@ def small_disk(where: Path, size: str) -> Iterator[Disk]:
 
 def tell(request: pytest.FixtureRequest, line: str) -> None:
     """Through the terminal, whatever pytest captures."""
-    capture = request.config.pluginmanager.getplugin("capturemanager")
+    capture: Any = request.config.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled() if capture else contextlib.nullcontext():
         print(f"\ntorture: {line}", flush=True)
