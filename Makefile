@@ -65,9 +65,8 @@ sweep: $(STAMP)
 tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)
 
-# Two processes: on the two cores that the ten minutes are promised for. Each is handed one half of the tests in
-# their order, so what a module's tests share is made once, and at the end takes from the other's.
-WORKERS := -n 2 --dist worksteal
+# Two processes: on the two cores that the ten minutes are promised for. A file's tests share what they train.
+WORKERS := -n 2 --dist loadfile
 
 test: $(STAMP)
 	@exec $(VENV)/bin/python -m pytest $(WORKERS) $(ARGS)

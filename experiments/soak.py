@@ -33,6 +33,9 @@ def main() -> int:
     args = parser.parse_args()
     reports = max(4, round(args.steps / REPORT_STEPS))
     run = request.run_config("hover", None, runs.ConfigFile(), {"steps": args.steps, "reports": reports}, 0, 1)
+    if args.out.exists():
+        print(f"{args.out}: exists already; give another --out", file=sys.stderr)
+        return 2
     (args.out / "run").mkdir(parents=True)
     began, compiled, rows = time.perf_counter(), [0], []
 
@@ -58,7 +61,8 @@ def main() -> int:
         print(f"too short to judge: {len(rows)} reports", file=sys.stderr)
         return 1
     found = verdict(rows)
-    (args.out / "soak.json").write_text(json.dumps(found | {"versions": run.versions}, indent=2) + "\n")
+    ran = {"env_steps": int(rows[-1]["env_steps"]), "seconds": rows[-1]["seconds"], "versions": run.versions}
+    (args.out / "soak.json").write_text(json.dumps({**ran, **found}, indent=2) + "\n")
     print(json.dumps(found, indent=2))
     return 0 if all(promise["kept"] for promise in found.values()) else 1
 
@@ -93,7 +97,6 @@ def verdict(rows: list[dict[str, float]]) -> dict[str, dict[str, object]]:
             "greatest_drop": drop,
             "kept": bool(drop <= RETURN_LOSS * abs(best)),
         },
-        "run": {"env_steps": int(rows[-1]["env_steps"]), "seconds": rows[-1]["seconds"], "kept": True},
     }
 
 

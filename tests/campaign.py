@@ -31,6 +31,8 @@ SIZES = (
 )
 STEPS, REPORTS = 76_800, 12
 TRAIN = ["train", "pendulum", *SIZES.split()]
+LONG_STEPS, LONG_REPORTS = 512_000, 80  # for many kills in a row
+LONG = [*TRAIN, "--steps", str(LONG_STEPS), "--reports", str(LONG_REPORTS)]
 
 
 class Ended(NamedTuple):
@@ -162,6 +164,7 @@ def killed_again_and_again(
     kills: int,
     draw: random.Random,
     seconds: float,
+    whole_steps: int,
     **changes: str,
 ) -> int:
     """Start, kill at any moment, go on, until `kills` kills have happened; then to the end. How many did happen.
@@ -176,12 +179,12 @@ def killed_again_and_again(
         reached = max((steps[0] for steps in before if steps), default=0)
         process = start(*words, **changes)
         if happened == kills - 1:
-            wait_for(process, lambda: (folders[0] / "checkpoints" / str(STEPS) / checkpoint.SEAL).exists())
+            wait_for(process, lambda: (folders[0] / "checkpoints" / str(whole_steps) / checkpoint.SEAL).exists())
             wait_for(process, lambda: False, draw.uniform(0.0, 0.5))
         else:
-            ahead = reached / STEPS > (happened + 1) / kills
+            ahead = reached / whole_steps > (happened + 1) / kills
             moment = PATIENCE if happened == 1 else draw.uniform(0.0, seconds / 4 if ahead else span)
-            goal = reached + STEPS // REPORTS * max(1, REPORTS // kills - 1)
+            goal = reached + (whole_steps - reached) // (kills - happened + 1)
             wait_for(process, lambda goal=goal: checkpoint.steps(folders[0])[:1] > [goal], moment)
             wait_for(process, lambda: False, draw.uniform(0.0, 0.2))
         which = SIGNALS[happened % len(SIGNALS)]

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from campaign import TORTURE
 from frontdoor import TINY, complaint, qrl
 
 
@@ -153,6 +154,16 @@ def test_wrong_task_in_a_config_is_one_clear_line(
     assert "mine.json" in line
 
 
+def test_run_folder_named_from_here(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in runs/circle: evaluated, and gone on with."""
+    shutil.copytree(trained, tmp_path / "runs" / "mine")
+    monkeypatch.chdir(tmp_path)
+    assert qrl("evaluate", "runs/mine", "--starts", "5") == 0
+    (tmp_path / "runs" / "mine" / "summary.json").unlink()
+    assert qrl("train", "pendulum", "--out", "runs/mine", "--resume") == 0
+    assert (tmp_path / "runs" / "mine" / "summary.json").exists()
+
+
 def test_out_that_is_a_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("mine")
     assert "expected a folder" in complaint(capsys, "train", "hover", "--out", tmp_path / "file")
@@ -162,6 +173,7 @@ def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert "not a run folder" in complaint(capsys, "evaluate", tmp_path)
 
 
+@pytest.mark.skipif(not TORTURE, reason="part of make torture: Brax's own physics take a minute to compile")
 @pytest.mark.usefixtures("quick_compilation")
 def test_foreign_environment_trains(tmp_path: Path) -> None:
     """Our learner on one of Brax's own environments, which measures no success."""

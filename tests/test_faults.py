@@ -103,10 +103,14 @@ _READ: dict[tuple[Path, int], Checkpoint] = {}
 
 def assert_restores(run: Path, env_steps: int, like: TrainState, small: Path) -> list[str]:
     """`latest` gives this checkpoint, equal to what the whole run holds; its notes."""
-    found = restore.latest([run], like)
+    found = restore.latest([run], [run_config()], like)
     assert found.env_steps == env_steps
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
-    wanted = checkpoint.read(small, env_steps, one) if (small, env_steps) not in _READ else _READ[small, env_steps]
+    wanted = (
+        checkpoint.read(small, run_config(), env_steps, one)
+        if (small, env_steps) not in _READ
+        else _READ[small, env_steps]
+    )
     _READ[small, env_steps] = wanted
     for a, b in zip(jax.tree.leaves(found.states), jax.tree.leaves(wanted.state), strict=True):
         np.testing.assert_array_equal(a[0], b)
@@ -147,7 +151,7 @@ def test_all_damaged_starts_afresh(tmp_path: Path, small: Path, like: TrainState
     for i, env_steps in enumerate(checkpoint.steps(run)):
         DAMAGE[i % 3](run / "checkpoints" / str(env_steps) / checkpoint.SEAL)
         FAULTS.append(f"all damaged: {env_steps}")
-    found = restore.latest([run], like)
+    found = restore.latest([run], [run_config()], like)
     assert (found.env_steps, found.states, found.records) == (0, None, [])
     assert len(found.notes) == len(checkpoint.steps(small))
     assert all("starting afresh" in note for note in found.notes)
@@ -163,7 +167,7 @@ def test_newest_step_that_is_whole_for_all_seeds_is_used(tmp_path: Path, small: 
     flip(second / "checkpoints" / str(other) / checkpoint.SEAL)
     FAULTS.extend(["no seal of one seed", "damage of the other"])
     pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype), like)
-    found = restore.latest([first, second], pair)
+    found = restore.latest([first, second], [run_config()] * 2, pair)
     assert found.env_steps == both
     assert len(found.notes) == 1
     assert str(second) in found.notes[0]
@@ -183,6 +187,33 @@ def test_killed_while_a_checkpoint_is_removed(tmp_path: Path, small: Path, like:
                 (last / name).unlink()
             FAULTS.append(f"{count} files removed")
             assert_restores(run, before, like, small)
+
+
+def test_checkpoint_of_another_run_is_not_taken(small: Path, like: TrainState) -> None:
+    """Of the same shapes, and of another seed or discount: nothing would notice but that it says whose it is."""
+    before = campaign.digest(small)
+    for other in (run_config(seed=1), run_config(gamma=0.5)):
+        FAULTS.append("another run's checkpoint")
+        with pytest.raises(Foreign, match=r"of another run than config\.json"):
+            restore.latest([small], [other], like)
+    assert campaign.digest(small) == before
+
+
+def test_folder_made_anew_is_not_written_to(tmp_path: Path) -> None:
+    """Removed, and made again by somebody else while the run goes on: it is theirs."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    writer = checkpoint.Writer(folder, run_config())
+    save(folder, writer, [{"env_steps": 1, "success": 0.0, "return_mean": 0.0}])
+    shutil.rmtree(folder)
+    folder.mkdir()
+    FAULTS.append("folder made anew")
+    with pytest.raises(OSError, match="the run folder is gone"):
+        writer.check()
+    with pytest.raises(OSError, match="the run folder is gone"):
+        save(folder, writer, [{"env_steps": 2, "success": 0.0, "return_mean": 0.0}])
+    writer.close()
+    assert list(folder.iterdir()) == []
 
 
 def save(folder: Path, writer: checkpoint.Writer, rows: list[dict[str, float | int]]) -> None:
@@ -206,15 +237,15 @@ def test_the_last_five_and_the_best_are_kept(
 ) -> None:
     """A resume forgets none of it."""
     rows: list[dict[str, float | int]] = []
-    writer = checkpoint.Writer(tmp_path)
+    writer = checkpoint.Writer(tmp_path, run_config())
     for i, (success, value) in enumerate(reports, start=1):
         rows.append({"env_steps": i, "success": success, "return_mean": value})
         save(tmp_path, writer, rows)
         if i == resume_after:
             writer.close()
-            found = checkpoint.read(tmp_path, i, {"step": jax.ShapeDtypeStruct((), np.int32)})
+            found = checkpoint.read(tmp_path, run_config(), i, {"step": jax.ShapeDtypeStruct((), np.int32)})
             rows = list(found.record.rows)
-            writer = checkpoint.Writer(tmp_path)
+            writer = checkpoint.Writer(tmp_path, run_config())
     writer.close()
     assert checkpoint.steps(tmp_path) == [10, 9, 8, 7, 6, best]
 
@@ -235,7 +266,7 @@ JSON = st.recursive(
 def victim(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A sealed checkpoint at step 7."""
     folder = tmp_path_factory.mktemp("victim")
-    writer = checkpoint.Writer(folder)
+    writer = checkpoint.Writer(folder, run_config())
     state = {"weights": np.arange(6, dtype=np.float32).reshape(2, 3), "step": np.int32(7)}
     rows: list[dict[str, float | int]] = [{"env_steps": 7, "success": float("nan"), "return_mean": -1.5}]
     writer.save(Checkpoint(7, state, Record(rows=rows, train_seconds=1.25, report_seconds=0.5)))
@@ -249,7 +280,7 @@ LIKE = {"weights": jax.ShapeDtypeStruct((2, 3), np.float32), "step": jax.ShapeDt
 
 def read_or_complaint(folder: Path) -> Checkpoint | str:
     try:
-        return checkpoint.read(folder, 7, LIKE)
+        return checkpoint.read(folder, run_config(), 7, LIKE)
     except (Damaged, Foreign) as error:
         return str(error)
 
@@ -428,7 +459,7 @@ def test_checkpoint_of_another_network_touches_nothing(
     shutil.copytree(newest(small), stopped / "checkpoints" / str(STEPS))
     before = campaign.digest(stopped)
     FAULTS.append("checkpoint of another network")
-    assert "of another" in refused(capfd, *TRAIN, "--out", stopped, "--resume")
+    assert "of another run than config.json" in refused(capfd, *TRAIN, "--out", stopped, "--resume")
     assert campaign.digest(stopped) == before
 
 

@@ -7,13 +7,14 @@ from pathlib import Path
 import pytest
 
 import campaign
-from campaign import TORTURE, TRAIN
+from campaign import LONG, LONG_STEPS, STEPS, TORTURE, TRAIN
 
-SAMPLE = [pytest.param("one", 3, {}, (), id="3 kills")]
+SAMPLE = [pytest.param("one", 3, {}, TRAIN, id="3 kills")]
 ALL = [
-    pytest.param("one", 60, {}, (), id="60 kills"),
-    pytest.param("seeds", 24, {}, ("--seeds", "2"), id="24 kills of two seeds"),
-    pytest.param("devices", 24, {"JAX_NUM_CPU_DEVICES": "2"}, (), id="24 kills on two devices"),
+    pytest.param("long", 40, {}, LONG, id="40 kills"),
+    pytest.param("one", 40, {}, TRAIN, id="40 kills of short runs"),
+    pytest.param("seeds", 24, {}, [*TRAIN, "--seeds", "2"], id="24 kills of two seeds"),
+    pytest.param("devices", 24, {"JAX_NUM_CPU_DEVICES": "2"}, TRAIN, id="24 kills on two devices"),
 ]
 
 
@@ -25,32 +26,35 @@ def test_killed_run_equals_one_never_stopped(
     name: str,
     kills: int,
     variables: dict[str, str],
-    words: tuple[str, ...],
+    words: list[str],
 ) -> None:
     """By SIGTERM, SIGINT and SIGKILL in turn, while it loads, compiles, trains, saves and draws."""
     if name == "one":
         whole = campaign.whole_run(tmp_path_factory)
     else:
         whole = tmp_path / "whole"
-        campaign.done(campaign.qrl(*TRAIN, *words, "--out", whole, **variables))
+        campaign.done(campaign.qrl(*words, "--out", whole, **variables))
     begun = time.monotonic()
     if TORTURE:  # how long one takes whose programs are compiled
-        campaign.done(campaign.qrl(*TRAIN, *words, "--out", tmp_path / "again", **variables))
+        campaign.done(campaign.qrl(*words, "--out", tmp_path / "again", **variables))
     seconds = max(time.monotonic() - begun, 8.0)
     seeds = ("seed-0", "seed-1") if "--seeds" in words else (".",)
-    happened, again = 0, 0
+    happened, again, most = 0, 0, 0
     while happened < kills:  # a run that ended too early counts as far as it went
         again += 1
         killed = tmp_path / f"killed-{again}"
         draw = random.Random(f"{name} {again}")
-        happened += campaign.killed_again_and_again(
-            [*TRAIN, *words, "--out", killed, "--resume"],
+        once = campaign.killed_again_and_again(
+            [*words, "--out", killed, "--resume"],
             [killed / seed for seed in seeds],
             kills - happened,
             draw,
             seconds,
+            LONG_STEPS if words is LONG else STEPS,
             **variables,
         )
+        happened, most = happened + once, max(most, once)
         for seed in seeds:
             campaign.assert_same_run(killed / seed, whole / seed)
-    campaign.tell(request, f"{happened} kills ({request.node.callspec.id}, in {again} runs), 0 lost updates")
+    assert most >= 20 or words is not LONG
+    campaign.tell(request, f"{happened} kills ({request.node.callspec.id}, up to {most} in a row), 0 lost updates")

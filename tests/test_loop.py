@@ -134,8 +134,9 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, who
     pair = run_config(seeds=2)
     train(tmp_path / "pair", pair, pendulum)
     train(tmp_path / "one", run_config(seed=1), pendulum)
-    for folder, single in ((tmp_path / "pair" / "seed-0", whole), (tmp_path / "pair" / "seed-1", tmp_path / "one")):
-        assert_same(last_state(folder, run_config(), pendulum), last_state(single, run_config(), pendulum))
+    for seed, single in ((0, whole), (1, tmp_path / "one")):
+        folder, run = tmp_path / "pair" / f"seed-{seed}", run_config(seed=seed)
+        assert_same(last_state(folder, run, pendulum), last_state(single, run, pendulum))
         assert metrics(folder) == metrics(single)
 
 

@@ -15,7 +15,8 @@ from campaign import TORTURE
 from qrl import checkpoint
 
 SURVIVOR_SECONDS = 60.0  # in which the other has to end
-TRAIN = [*campaign.TRAIN, "--steps", "3.2e4", "--reports", "5"]
+STEPS = 32_000
+TRAIN = [*campaign.TRAIN, "--steps", str(STEPS), "--reports", "5"]
 # Compiled in haste, which takes half the time: each of the two compiles all of it, again and again.
 HASTE = {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
 TWO_DEVICES = {"JAX_NUM_CPU_DEVICES": "2", **HASTE}
@@ -82,11 +83,23 @@ def sealed(run: Path) -> int:
     return len(checkpoint.steps(run)) if (run / "checkpoints").is_dir() else 0
 
 
+@pytest.mark.skipif(not TORTURE, reason="part of make torture")
+def test_a_refused_checkpoint_leaves_nobody_waiting(tmp_path: Path, whole: Path) -> None:
+    """Found when all are at work: the first says why, and both end."""
+    run = campaign.unfinished(whole, tmp_path / "run", STEPS // 2)
+    seal = run / "checkpoints" / str(checkpoint.steps(run)[0]) / checkpoint.SEAL
+    seal.write_text(seal.read_text().replace('"format":1', '"format":2'))
+    first, second = (campaign.end(p, SURVIVOR_SECONDS) for p in pair(*TRAIN, "--out", run, "--resume"))
+    assert first.code == 2
+    assert "later version of qrl" in first.error
+    assert second.code != 0
+
+
 def test_wrong_input_is_told_once(tmp_path: Path) -> None:
     """By the first process; the other ends by itself, and nothing is made."""
     first, second = (
         campaign.end(process, SURVIVOR_SECONDS) for process in pair("train", "hoverr", "--out", tmp_path / "run")
     )
     assert "unknown task 'hoverr' (did you mean 'hover'?)" in campaign.complaint(first, 2)
-    assert second.error == ""
+    assert (second.code, second.error) == (2, "")
     assert not (tmp_path / "run").exists()

@@ -8,7 +8,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export JAX_PLATFORMS=cpu QRL_TORTURE=1
 unset MAKEFLAGS MFLAGS MAKELEVEL
 
-files=(tests/test_kills.py tests/test_peers.py tests/test_faults.py tests/test_fuzz.py)
+files=(tests/test_{kills,peers,faults,fuzz,cli}.py)
 
 work=$(mktemp -d)
 touch "$work/codes"
@@ -38,6 +38,7 @@ from pathlib import Path
 work, seconds = Path(sys.argv[1]), sys.argv[2]
 cases = 0
 broke = []
+skipped = []
 codes = [line.split() for line in (work / "codes").read_text().splitlines()]
 for file, code in codes:
     report = work / f"{Path(file).stem}.xml"
@@ -51,6 +52,7 @@ for file, code in codes:
         for test in suite.iter("testcase"):
             if test.find("failure") is not None or test.find("error") is not None:
                 found.append(f"{file}::{test.get('name')}" if test.get("classname") else f"{file}, as it was collected")
+        skipped += [test.get("name") for test in suite.iter("testcase") if test.find("skipped") is not None]
     broke += found or ([f"{file} (pytest's exit code {code})"] if code != "0" else [])
 faults = sum(int(n) for n in re.findall(r"^torture: (\d+) (?:faults|kills?)\b", (work / "said").read_text(), re.MULTILINE))
 trials = re.findall(r"^newest: (.*?): (held|broke):", (work / "newest").read_text(), re.MULTILINE)
@@ -58,6 +60,7 @@ broke += [f"the newest versions on {python}" for python, held in trials if held 
 broke += [f"no {what} ran" for what, n in (("fault", faults), ("fuzz case", cases), ("version trial", len(trials))) if not n]
 print(
     f"torture: {faults:,} faults, {cases:,} fuzz cases and {len(trials)} version trials in {seconds} s; "
+    + (f"{len(skipped)} skipped ({', '.join(skipped)}); " if skipped else "")
     + (f"broke: {', '.join(broke)}" if broke else "nothing broke")
 )
 sys.exit(bool(broke))

@@ -11,7 +11,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -23,7 +23,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from qrl.runs import Row, replace_text
+from qrl.runs import Row, RunConfig, replace_text
 
 KEEP = 5  # the last so many, and the best
 FORMAT: Literal[1] = 1
@@ -48,9 +48,10 @@ class _Seal(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
 
     format: Literal[1] = FORMAT
+    run_sha256: str  # whose it is
     record: Record
-    sha256: dict[str, str]  # of each file, by its path in the checkpoint
     record_sha256: str
+    sha256: dict[str, str]  # of each file, by its path in the checkpoint
 
 
 class Damaged(OSError):
@@ -58,7 +59,7 @@ class Damaged(OSError):
 
 
 class Foreign(OSError):
-    """A checkpoint is whole, and not one of this configuration or version."""
+    """A checkpoint is whole, and not one of this run, or of another version of qrl."""
 
 
 class Checkpoint(NamedTuple):
@@ -72,27 +73,31 @@ def steps(folder: Path) -> list[int]:
     return sorted(int(path.parent.name) for path in _root(folder).glob(f"*/{SEAL}") if _is_step(path.parent))[::-1]
 
 
-def read(folder: Path, env_steps: int, like: Any) -> Checkpoint:
-    """The checkpoint at `env_steps`; `like` gives structure, shapes and types of a member's state.
+def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
+    """The checkpoint of `run` at `env_steps`; `like` gives structure, shapes and types of a member's state.
 
-    Raises Damaged where the files are not those that were sealed, Foreign where they hold something else than `like`.
+    Raises Damaged where the files are not those that were sealed, Foreign where they are of another run or version.
     """
     path = _root(folder) / str(env_steps)
-    record = _checked(path)
+    seal = _checked(path)
+    if seal.run_sha256 != run.sha256:
+        raise Foreign(f"{path}: of another run than config.json (another task, hyperparameter, seed or version of qrl)")
     wanted = _by_name(like)
     try:
         with ocp.StandardCheckpointer(multiprocessing_options=_ONE_PROCESS) as orbax:
-            found = orbax.restore(path / STATE, wanted)
-    except (ValueError, KeyError, TypeError, OSError) as error:
-        raise Foreign(f"{path}: of another version or configuration ({_first(error)})") from None
+            found = orbax.restore((path / STATE).resolve(), wanted)
+    except OSError as error:
+        raise Damaged(f"{path}: cannot be read ({_first(error)})") from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise Foreign(f"{path}: of another version of qrl ({_first(error)})") from None
     for name, leaf in wanted.items():  # Orbax hands back whatever it finds
         if (found[name].shape, found[name].dtype) != (leaf.shape, leaf.dtype):
             raise Foreign(
-                f"{path}: of another configuration than config.json ({name} is {found[name].dtype}"
-                f"{list(found[name].shape)}, not {leaf.dtype}{list(leaf.shape)})"
+                f"{path}: of another version of qrl ({name} is {found[name].dtype}{list(found[name].shape)},"
+                f" not {leaf.dtype}{list(leaf.shape)})"
             )
     state = jax.tree.unflatten(jax.tree.structure(like), [np.asarray(found[name]) for name in wanted])
-    return Checkpoint(env_steps, state, record)
+    return Checkpoint(env_steps, state, seal.record)
 
 
 def _by_name(tree: Any) -> dict[str, Any]:
@@ -100,8 +105,8 @@ def _by_name(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): x for path, x in jax.tree.leaves_with_path(tree)}
 
 
-def _checked(path: Path) -> Record:
-    """The record of a checkpoint whose every file is as it was sealed."""
+def _checked(path: Path) -> _Seal:
+    """The seal of a checkpoint whose every file is as it was sealed."""
     try:
         text = (path / SEAL).read_bytes()
         version = json.loads(text)
@@ -125,29 +130,33 @@ def _checked(path: Path) -> Record:
             raise Damaged(f"{path}/{name}: cannot be read ({_first(error)})") from None
         if not same:
             raise Damaged(f"{path}/{name}: is damaged")
-    return seal.record
+    return seal
 
 
 def clear_after(folder: Path, env_steps: int) -> None:
-    """Leave no checkpoint after `env_steps`: what is sealed goes if it is whole, and anything else is set aside."""
+    """Leave no checkpoint after `env_steps`: what is whole or was never sealed goes, what is damaged is set aside."""
     for path in sorted(_root(folder).glob("*")):
         if not _is_step(path) or int(path.name) <= env_steps:
             continue
-        with suppress(Damaged, Foreign):
-            _checked(path)
+        if (path / SEAL).exists():
+            try:
+                _checked(path)
+            except (Damaged, Foreign):
+                aside = path.with_name(f"aside-{path.name}")
+                shutil.rmtree(aside, ignore_errors=True)
+                path.rename(aside)
+                continue
             (path / SEAL).unlink()  # first: killed half-way, what is left is no checkpoint
-            shutil.rmtree(path)
-            continue
-        aside = path.with_name(f"aside-{path.name}")
-        shutil.rmtree(aside, ignore_errors=True)
-        path.rename(aside)
+        shutil.rmtree(path)
 
 
 class Writer:
-    """Saves checkpoints of one run folder, one at a time, while the training goes on."""
+    """Saves checkpoints of one run into its folder, one at a time, while the training goes on."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, run: RunConfig) -> None:
         self._folder = folder
+        self._open = os.open(folder, os.O_RDONLY)  # as long as it is, no other folder can be taken for it
+        self._run_sha256 = run.sha256
         self._rows: list[Row] = []
         self._thread = ThreadPoolExecutor(1, "checkpoint")
         self._pending: Future[None] | None = None
@@ -171,7 +180,8 @@ class Writer:
         self._pending = self._thread.submit(self._save, checkpoint)
 
     def check(self) -> None:
-        """OSError if the last save has failed already."""
+        """OSError if the run folder is not there any more, or the last save has failed already."""
+        self._still_there()
         if self._pending and self._pending.done():
             self.wait()
 
@@ -186,10 +196,17 @@ class Writer:
         self._thread.shutdown()
         with suppress(OSError, ValueError):
             self._orbax.close()
+        os.close(self._open)
+
+    def _still_there(self) -> None:
+        ours, there = os.fstat(self._open), None
+        with suppress(FileNotFoundError):
+            there = self._folder.stat()
+        if not there or (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino):
+            raise OSError(f"{self._folder}: the run folder is gone")
 
     def _save(self, checkpoint: Checkpoint) -> None:
-        if not self._folder.is_dir():  # Orbax would make it anew
-            raise OSError(f"{self._folder}: the run folder is gone")
+        self._still_there()  # Orbax would make it anew
         self._rows = checkpoint.record.rows
         path = _root(self._folder) / str(checkpoint.env_steps)
         try:
@@ -202,28 +219,31 @@ class Writer:
                 force=True,
             )
             seal = _Seal(
+                run_sha256=self._run_sha256,
                 record=checkpoint.record,
-                sha256={name: _sha256(path / name) for name in _files(path)},
                 record_sha256=_record_sha256(checkpoint.record),
+                sha256={name: _sha256(path / name, on_disk=True) for name in _files(path)},
             )
+            for inside in (path, *(place for place in path.rglob("*") if place.is_dir())):
+                _sync(inside)
             replace_text(path / SEAL, seal.model_dump_json() + "\n")
             _give_back()
         except (OSError, ValueError) as error:  # ValueError: how Orbax reports a full disk
             raise OSError(f"{path}: the checkpoint could not be written ({_first(error)})") from None
 
-    def _best(self, among: Sequence[int]) -> int:
-        """Of these steps the one whose report was best; the first, where none had a report."""
+    def _best(self, among: Sequence[int]) -> int | None:
+        """Of these steps the one whose report was best; None where none had a report."""
         reports = {row["env_steps"]: row for row in self._rows}
         ranks = {
             step: (_number(row["success"]), _number(row["return_mean"])) for step in among if (row := reports.get(step))
         }
-        return max(ranks, key=lambda step: ranks[step], default=among[0])
+        return max(ranks, key=lambda step: ranks[step], default=None)
 
 
 class _Preserve(policies.PreservationPolicy):
     """The last KEEP, and the best."""
 
-    def __init__(self, best: Any) -> None:
+    def __init__(self, best: Callable[[Sequence[int]], int | None]) -> None:
         self._best = best
 
     def should_preserve(self, checkpoints: Sequence[Any], *, context: Any) -> Sequence[bool]:
@@ -266,9 +286,19 @@ def _files(path: Path) -> list[str]:
     return sorted(str(f.relative_to(path)) for f in path.rglob("*") if f.is_file() and f.name != SEAL)
 
 
-def _sha256(path: Path) -> str:
+def _sha256(path: Path, *, on_disk: bool = False) -> str:
     with path.open("rb") as file:
+        if on_disk:  # a seal that outlives a crash must not vouch for what did not; Orbax leaves it to the system
+            os.fsync(file.fileno())
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync(folder: Path) -> None:
+    at = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(at)
+    finally:
+        os.close(at)
 
 
 def _record_sha256(record: Record) -> str:

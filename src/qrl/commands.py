@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -18,7 +19,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from qrl import deploy, loop, peers, plots, processes, request, restore, runs, sweep_command
 from qrl.checkpoint import Foreign
 from qrl.deploy import EVALUATION_STARTS_SEED
-from qrl.evaluate import Flights, summarise
+from qrl.evaluate import summarise
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.export.kernel import PossibleOverflow
 from qrl.export.report import gates
@@ -35,34 +36,41 @@ PICTURE_FLIGHTS = 5
 
 def run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
+    commands = {
+        "train": train,
+        "evaluate": evaluate,
+        "export": export,
+        "sweep": sweep_command.sweep,
+        "tasks": list_tasks,
+    }
+    code = FAILED
     try:
-        commands = {
-            "train": train,
-            "evaluate": evaluate,
-            "export": export,
-            "sweep": sweep_command.sweep,
-            "tasks": list_tasks,
-        }
         return commands[args.command](args)
-    except (BadInput, Foreign) as error:
+    except BadInput as error:  # every process hears of it
         complain(str(error))
         return WRONG_INPUT
+    except Foreign as error:
+        complain(str(error))
+        code = WRONG_INPUT
     except (loop.NotFinite, PossibleOverflow, ProofFailed) as error:
         complain(str(error))
     except OSError as error:
         complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except jax.errors.JaxRuntimeError as error:  # out of memory, above all
         complain(str(error))
-    except ValueError as error:
-        if not jax.distributed.is_initialized():
-            raise
-        complain(f"another process of the run is gone: {error}")  # how JAX says it
     except KeyboardInterrupt:
         complain("interrupted")
+    except Exception as error:
+        if not jax.distributed.is_initialized():
+            raise
+        if isinstance(error, ValueError) and "Gloo" in str(error):  # how JAX says it on CPUs
+            complain(f"another process of the run is gone: {error}")
+        else:
+            traceback.print_exc()
     if jax.distributed.is_initialized():  # Python's own end would wait for the others, and they for this process
         sys.stdout.flush()
-        os._exit(FAILED)
-    return FAILED
+        os._exit(code)
+    return code
 
 
 def list_tasks(_: argparse.Namespace) -> int:
@@ -82,17 +90,21 @@ def train(args: argparse.Namespace) -> int:
     console.quiet = process.number != peers.FIRST
     processes.join(process)
     with ExitStack() as until_done:
-        try:
-            plan = _plan(args, until_done) if peers.first() else None
-        except BaseException:
-            peers.firsts(np.bool_(False))  # the others wait to hear
-            peers.firsts_text("")
-            raise
-        held = bool(peers.firsts(np.bool_(plan is not None and plan.held)))
-        config = peers.firsts_text(plan.config.model_dump_json() if plan else "")
-        if not config:
-            return DONE
-        return _train(RunConfig.model_validate_json(config), plan.out if plan else Path(), held, args, begun)
+        plan: _Plan | None = None
+        wrong: Exception | None = None
+        if peers.first():
+            try:
+                plan = _plan(args, until_done)
+            except Exception as error:  # raised once the others, who wait, have heard
+                wrong = error
+        code = WRONG_INPUT if isinstance(wrong, BadInput) else FAILED if wrong else DONE
+        code, going, held = map(int, peers.firsts(np.array([code, plan is not None, plan is not None and plan.held])))
+        if wrong:
+            raise wrong
+        if not going:
+            return code
+        config = RunConfig.model_validate_json(peers.firsts_text(plan.config.model_dump_json() if plan else ""))
+        return _train(config, plan.out if plan else Path(), bool(held), args, begun)
 
 
 class _Plan(NamedTuple):
@@ -118,14 +130,16 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
         if loop.finished(out, config):
             console.print(f"{out}: finished already; nothing to do")
             return None
-        if changed := request.other_versions(config.versions):
-            console.print(f"other versions than it began with, so the bits may differ: {changed}")
+        if changed := request.changed_since(config):
+            console.print(f"not as it began, so the bits may differ: {changed}")
     env = request.environment(config.task)
     where = "command line" if "observation_scale" in flags else str(args.config or config.task.name)
     request.check(env, config.learner, where)
     request.check_devices(config)
     out.mkdir(parents=True, exist_ok=True)
     until_done.enter_context(processes.locked(out / "lock", f"{out}: another process is at work in it"))
+    if held != (out / "config.json").exists():
+        raise BadInput(f"{out}: another process was at work in it just now; try again")
     _prepare(out, config, held)
     return _Plan(config, out, held)
 
@@ -136,13 +150,13 @@ def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, b
     console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {devices} -> {out}")
     env = request.environment(config.task)
     with stop_requested() as stopped:
-        flights = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
-    if flights is None:
+        finished = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
+    if finished is None:
         what = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
         console.print(f"stopped and saved; to go on: make train {what} OUT={shlex.quote(str(out))} RESUME=1")
         return FAILED
     if peers.first():
-        _finish(out, config, flights, time.perf_counter() - begun)
+        _finish(out, config, finished, time.perf_counter() - begun)
     return DONE
 
 
@@ -163,19 +177,21 @@ def _value(text: str) -> Any:
 
 
 def _prepare(out: Path, config: RunConfig, held: bool) -> None:
-    runs.tidy(out)
     for i, folder in enumerate(runs.members(out, config)):
         folder.mkdir(parents=True, exist_ok=True)
-        runs.tidy(folder)
-        if not held:
+        if held:
+            runs.tidy(folder)
+        else:
             runs.write_json(folder / "config.json", config.member(i).model_dump(mode="json"))
-    if not held:
+    if held:
+        runs.tidy(out)
+    else:
         runs.write_json(out / "config.json", config.model_dump(mode="json"))
 
 
-def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
-    """Show what happens, a line a report; returns the flights of a run that came to its end."""
-    flights, started = None, time.perf_counter()
+def _follow(events: Iterator[loop.Event], config: RunConfig) -> loop.Finished | None:
+    """Show what happens, a line a report; returns how it ended, if it came to its end."""
+    finished, started = None, time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=config.learner.unrolls * config.learner.unroll_size, note="")
@@ -196,11 +212,11 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> Flights | None:
                 note = f"{event.steps_per_second:,.0f} steps/s, {clock(event.seconds_left)} left"
                 bar.update(task, completed=event.env_steps, note=note)
             elif isinstance(event, loop.Finished):
-                flights = event.flights
+                finished = event
             else:
                 bar.update(task, completed=event.rows[0]["env_steps"])
                 console.print(_line(event.rows, event.seconds_left))
-    return flights
+    return finished
 
 
 _HEADER = f"{'steps':>12} {'steps/s':>10} {'return':>20} {'success':>16} {'trained':>8} {'left':>7}"
@@ -224,16 +240,16 @@ def _spread(rows: list[Row], name: str, form: str) -> str:
     return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"
 
 
-def _finish(out: Path, config: RunConfig, flights: Flights, seconds: float) -> None:
+def _finish(out: Path, config: RunConfig, finished: loop.Finished, seconds: float) -> None:
     """Pictures, then summary.json of each seed, then that of the whole."""
     folders = runs.members(out, config)
-    history = [runs.read_metrics(folder) for folder in folders]
+    history = finished.rows
     for i, folder in enumerate(folders):
         title = f"{config.task.name}, seed {config.seed + i}"
         with runs.writing(folder / "learning_curve.png"):
             plots.learning_curve(folder / "learning_curve.png", [history[i]], title)
         if config.task.spec:
-            shown = np.asarray(flights.observations[i, :PICTURE_FLIGHTS])
+            shown = np.asarray(finished.flights.observations[i, :PICTURE_FLIGHTS])
             with runs.writing(folder / "flight.png"):
                 picture.flights(folder / "flight.png", _task(config), shown)
         runs.write_json(folder / "summary.json", {"result": history[i][-1], "command_seconds": round(seconds, 1)})
@@ -266,8 +282,8 @@ def evaluate(args: argparse.Namespace) -> int:
     table: list[dict[str, Any]] = []
     for i, folder in enumerate(runs.members(args.run, config)):
         try:
-            trainer, state, env_steps = restore.last(env, config, folder)
-        except FileNotFoundError as error:
+            trainer, state, env_steps = restore.last(env, config.member(i), folder)
+        except OSError as error:
             raise BadInput(str(error)) from None
         flights = jax.tree.map(lambda x: x[0], trainer.fly(state.learner, stack([point(env, config.learner)]), starts))
         result = {"seed": config.seed + i, "env_steps": env_steps, "starts": args.starts, **summarise(flights)}

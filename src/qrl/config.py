@@ -84,7 +84,7 @@ class Config(BaseModel):
     xi: Traced[Positive | None] = Field(description="constant margin in its stead; null: none")
     normalise_advantage: Static[bool] = Field(description="divide A by its root mean square over the minibatch")
 
-    reports: Static[Count] = Field(description="reports, evaluations and checkpoints of a run")
+    reports: Static[Count] = Field(description="reports of a run: each an evaluation and a checkpoint")
     report_flights: Static[Count] = Field(description="fixed starts flown at each report")
 
     @model_validator(mode="after")

@@ -61,6 +61,7 @@ class Finished:
     """All steps are made and saved; the policies that ship, flown once more from the reports' starts."""
 
     flights: Flights  # leading axis: seeds
+    rows: list[list[Row]]  # of each seed
 
 
 Event = GoingOn | Compiling | Progress | Reported | Finished
@@ -69,15 +70,15 @@ Event = GoingOn | Compiling | Progress | Reported | Finished
 class Member:
     """What the host keeps of one seed."""
 
-    def __init__(self, folder: Path, env_steps: int, rows: list[Row]) -> None:
+    def __init__(self, folder: Path, run: RunConfig, env_steps: int, rows: list[Row]) -> None:
         self.folder = folder
         self.rows = rows
-        self.checkpoints = checkpoint.Writer(folder)
+        self.checkpoints = checkpoint.Writer(folder, run)
         self._tensorboard = EventLog(folder / "tensorboard", purge_step=env_steps + 1)
-        if rows:
-            runs.write_metrics(folder, rows)  # those after the checkpoint are cut
+        runs.write_metrics(folder, rows)  # those after the checkpoint are cut
 
     def record(self, row: Row) -> None:
+        self.checkpoints.check()
         self.rows.append(row)
         runs.write_metrics(self.folder, self.rows)
         self._tensorboard.add(row)
@@ -99,11 +100,12 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
     trainer = Trainer(env, run.learner, spread(jax.devices(), run.seeds, run.learner.logical_shards))
     points = stack([point(env, run.learner)] * run.seeds)
     folders = runs.members(out, run) if peers.first() else []
+    configs = [run.member(i) for i in range(run.seeds)]
     begin, clock, rows = 0, Clock(), [[] for _ in folders]
     states: Any = None
     if resume:
         like = restore.shapes(trainer, points)
-        found = restore.latest(folders, like) if folders else restore.Restored(0, None, [], [])
+        found = restore.latest(folders, configs, like) if folders else restore.Restored(0, None, [], [])
         begin = int(peers.firsts(np.int32(found.env_steps)))
         if found.records:
             rows = [list(record.rows) for record in found.records]
@@ -118,7 +120,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
         states = trainer.init(seeds(run.seed, run.seeds), points)
     members: list[Member] = []
     try:
-        members = [Member(folder, begin, rows[i]) for i, folder in enumerate(folders)]
+        members = [Member(folder, configs[i], begin, rows[i]) for i, folder in enumerate(folders)]
         yield Compiling("training")
         advance = compile_advance(trainer, states, points)
         yield Compiling("evaluation")
@@ -129,7 +131,8 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
             yield saver.heed(lap)
         saver.end()
         if begin == run.learner.unrolls * run.learner.unroll_size:
-            yield Finished(programs.on_host(programs.fly(states.learner, points, report_starts(run.learner))))
+            flights = programs.on_host(programs.fly(states.learner, points, report_starts(run.learner)))
+            yield Finished(flights, [member.rows for member in members])
     finally:
         for member in members:
             member.close()
@@ -176,7 +179,8 @@ class _Saver:
             member.checkpoints.check()
         for i, what in enumerate(lap.faults):
             if what:
-                raise NotFinite(f"{self._kept(i)[0]}seed {self._run.seed + i}: {what}; {self._kept(i)[1]}")
+                where, kept = self._kept(i)
+                raise NotFinite(f"{where}seed {self._run.seed + i}: {what}; {kept}")
 
     def _kept(self, i: int) -> tuple[str, str]:
         if not self._members:

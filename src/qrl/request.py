@@ -98,7 +98,7 @@ def run_config(
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=runs.versions(),
-        devices=[str(device) for device in jax.devices()],
+        devices=here_devices(),
     )
     return _countable(run, str(config or "command line"))
 
@@ -170,11 +170,22 @@ def check_devices(run: RunConfig) -> None:
         )
 
 
-def other_versions(began: dict[str, str]) -> str:
-    """Which packages are of another version than those that a run began with."""
+def changed_since(run: RunConfig) -> str:
+    """Which packages and devices are others than those that a run began with."""
     now = runs.versions()
-    changed = [name for name in sorted(began.keys() | now.keys()) if began.get(name) != now.get(name)]
-    return ", ".join(f"{name} {began.get(name, 'none')}, now {now.get(name, 'none')}" for name in changed)
+    names = sorted(run.versions.keys() | now.keys())
+    changed = [
+        f"{name} was {run.versions.get(name, 'none')}, is {now.get(name, 'none')}"
+        for name in names
+        if run.versions.get(name) != now.get(name)
+    ]
+    if (here := here_devices()) != run.devices:
+        changed.append(f"devices were {', '.join(run.devices)}, are {', '.join(here)}")
+    return "; ".join(changed)
+
+
+def here_devices() -> list[str]:
+    return [str(device) for device in jax.devices()]
 
 
 def stored(folder: Path) -> RunConfig:

@@ -26,17 +26,17 @@ def shapes(trainer: Trainer, points: Point) -> TrainState:
     return jax.eval_shape(trainer.init, laps.seeds(0, len(jax.tree.leaves(points)[0])), points)
 
 
-def latest(folders: list[Path], like: TrainState) -> Restored:
+def latest(folders: list[Path], configs: list[RunConfig], like: TrainState) -> Restored:
     """The last checkpoint that is whole in every member's folder; `like`: shapes and types of all their states.
 
-    What is damaged, or was never finished, is set aside; what is later goes: it will be made again, the same.
+    What is damaged is set aside; what is later, or was never finished, goes: it will be made again, the same.
     Raises checkpoint.Foreign, with nothing touched, where what was saved is of something else.
     """
     one, notes = _one(like), []
     common = set.intersection(*[set(checkpoint.steps(folder)) for folder in folders])
     for env_steps in sorted(common, reverse=True):
         try:
-            found = [checkpoint.read(folder, env_steps, one) for folder in folders]
+            found = [checkpoint.read(*member, env_steps, one) for member in zip(folders, configs, strict=True)]
         except Damaged as error:
             notes.append(str(error))
             continue
@@ -54,13 +54,14 @@ def latest(folders: list[Path], like: TrainState) -> Restored:
 def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState, int]:
     """Trainer, state (leading axis: one member) and environment steps of a seed's last checkpoint.
 
-    Raises FileNotFoundError, naming the folder, where there is none; OSError where it is not whole.
+    Raises FileNotFoundError, naming the folder, where there is none; OSError where it is not whole: whoever flies a
+    policy should not be given an earlier one unasked.
     """
     saved = checkpoint.steps(folder)
     if not saved:
         raise FileNotFoundError(f"{folder}: no checkpoint")
     trainer = Trainer(env, run.learner)
-    found = checkpoint.read(folder, saved[0], _one(shapes(trainer, stack([point(env, run.learner)]))))
+    found = checkpoint.read(folder, run, saved[0], _one(shapes(trainer, stack([point(env, run.learner)]))))
     return trainer, trainer.place(stack([found.state])), found.env_steps
 
 

@@ -1,6 +1,7 @@
 """The run folder's files: what was asked (config.json) and what happened (metrics.csv)."""
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -59,6 +60,12 @@ class RunConfig(BaseModel):
     def member(self, index: int) -> "RunConfig":
         """The config of one of the seeds trained side by side."""
         return self.model_copy(update={"seed": self.seed + index, "seeds": 1})
+
+    @property
+    def sha256(self) -> str:
+        """What tells this run from every other, whatever it is run on."""
+        asked = self.model_dump(mode="json", include={"task", "learner", "seed", "seeds"})
+        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -130,9 +137,10 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def tidy(folder: Path) -> None:
-    """Remove what a killed process left of files that it was writing; for who alone writes in this folder."""
-    for temporary in folder.glob("*.[0-9]*.tmp"):
-        temporary.unlink(missing_ok=True)
+    """Remove what a killed process left of files that it was writing; for who alone writes in this run folder."""
+    for name in ("config.json", "metrics.csv", "summary.json", "evaluation.json"):
+        for temporary in folder.glob(f"{name}.*.tmp"):
+            temporary.unlink(missing_ok=True)
 
 
 def _plain(data: Any) -> Any:
@@ -172,7 +180,10 @@ def _number(cell: str) -> float | int:
 
 
 def write_metrics(folder: Path, rows: list[Row]) -> None:
-    """Write metrics.csv anew: a few dozen rows, and so it is never half-written."""
+    """Write metrics.csv anew: a few dozen rows, and so it is never half-written. Without a row there is none."""
+    if not rows:
+        (folder / "metrics.csv").unlink(missing_ok=True)
+        return
     replace_text(folder / "metrics.csv", csv_text(rows))
 
 
