@@ -31,7 +31,7 @@ SIZES = (
 )
 STEPS, REPORTS = 76_800, 12
 TRAIN = ["train", "pendulum", *SIZES.split()]
-LONG_STEPS, LONG_REPORTS = 512_000, 80  # for many kills in a row
+LONG_STEPS, LONG_REPORTS = 2_048_000, 160  # for many kills in a row: a second of training between two
 LONG = [*TRAIN, "--steps", str(LONG_STEPS), "--reports", str(LONG_REPORTS)]
 
 
