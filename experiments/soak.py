@@ -7,7 +7,6 @@ beside the run folder; exit code 1 if a promise is broken.
 """
 
 import argparse
-import csv
 import json
 import os
 import sys
@@ -47,20 +46,23 @@ def main() -> int:
     def over() -> bool:
         return time.perf_counter() - began > 3600 * args.hours
 
-    for event in loop.train(request.environment(run.task), run, args.out / "run", resume=False, stopped=over):
-        if isinstance(event, loop.Reported):
-            report = {name: event.rows[0][name] for name in ("env_steps", "return_mean", "return_min", "success")}
-            seconds = round(time.perf_counter() - began, 1)
-            rows.append(report | {"seconds": seconds, "memory_MB": memory_MB(), "compilations": compiled[0]})
-            print(rows[-1], flush=True)
-            with (args.out / "soak.csv").open("w", newline="") as file:
-                writer = csv.DictWriter(file, list(rows[0]))
-                writer.writeheader()
-                writer.writerows(rows)
+    not_finite = ""
+    try:
+        for event in loop.train(request.environment(run.task), run, args.out / "run", resume=False, stopped=over):
+            if isinstance(event, loop.Reported):
+                report = {name: event.rows[0][name] for name in ("env_steps", "return_mean", "return_min", "success")}
+                seconds = round(time.perf_counter() - began, 1)
+                rows.append(report | {"seconds": seconds, "memory_MB": memory_MB(), "compilations": compiled[0]})
+                print(rows[-1], flush=True)
+                runs.replace_text(args.out / "soak.csv", runs.csv_text(rows))
+    except loop.NotFinite as error:
+        not_finite = str(error)
+        print(not_finite, file=sys.stderr)
     if len(rows) < 4:
         print(f"too short to judge: {len(rows)} reports", file=sys.stderr)
         return 1
     found = verdict(rows)
+    found["finite"] = {"kept": not not_finite, "found": not_finite}
     ran = {"env_steps": int(rows[-1]["env_steps"]), "seconds": rows[-1]["seconds"], "versions": run.versions}
     (args.out / "soak.json").write_text(json.dumps({**ran, **found}, indent=2) + "\n")
     print(json.dumps(found, indent=2))

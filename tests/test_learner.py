@@ -23,9 +23,8 @@ def config(**changes: object) -> Config:
 
 def batch(seed: int = 0) -> Transition:
     rng = np.random.default_rng(seed)
-    ended = rng.random((B, T)) < 0.4
-    terminated = ended & (rng.random((B, T)) < 0.4)
-    truncated = ended & ~terminated
+    ended = rng.random((B, T)) < 0.3
+    terminated = ended & (rng.random((B, T)) < 0.5)
     values = Transition(
         observation=rng.normal(size=(B, T, F)),
         action=rng.normal(size=(B, T, A)),
@@ -33,8 +32,7 @@ def batch(seed: int = 0) -> Transition:
         reward=rng.normal(size=(B, T)),
         next_observation=rng.normal(size=(B, T, F)),
         terminated=terminated,
-        truncated=truncated,
-        absorbed=truncated & (np.cumsum(truncated) % 2 == 0).reshape(B, T),
+        truncated=ended & ~terminated,
     )
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
 
@@ -67,9 +65,7 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
         carried = 0.0
         for i in reversed(range(T)):
             carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
-            for_ever = c.reward_scale * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
-            after = for_ever if d.absorbed[b, i] else v_next[b, i]
-            bootstrap = 0.0 if d.terminated[b, i] else after
+            bootstrap = 0.0 if d.terminated[b, i] else v_next[b, i]
             a_trace[b, i] = c.reward_scale * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
             carried = (min(1.0, ratio[b, i]) if off_policy else 1.0) * a_trace[b, i]
             v_trace[b, i] = v[b, i] + carried
@@ -135,7 +131,6 @@ def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[ja
     after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
     log_pi = log_density(data.action, learner.policy.apply(state.params.policy, data.observation), c.sigma)
     rho = jnp.exp(log_pi - data.log_mu)
-    after = jnp.where(data.absorbed > 0, c.reward_scale * data.reward / (1.0 - c.gamma), after)
     return jax.vmap(lambda *x: vtrace(*x, gamma=c.gamma, lam=c.lam))(
         c.reward_scale * data.reward, value, after, data.terminated, data.truncated, rho
     )

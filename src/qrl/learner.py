@@ -17,7 +17,6 @@ from qrl.objective import perceptron
 from qrl.types import Networks, Transition
 from qrl.vtrace import vtrace
 
-MIN_DISCOUNTING = 1e-3  # of 1 − gamma where a reward goes on for ever
 MAX_NORMALISED = 10.0  # standard deviations at which a standardised observation is clipped
 
 
@@ -157,12 +156,7 @@ class Learner:
         observation = self.scale(state, flat(batch.observation))
         next_observation = self.scale(state, flat(batch.next_observation))
         value = _apply(self.critic, params.critic, observation).reshape(samples)
-        reward = hyper["reward_scale"] * batch.reward
         next_value = jax.lax.stop_gradient(_apply(self.critic, params.critic, next_observation)).reshape(samples)
-        # Beyond an environment's own bounds no transition begins, and so V is never fitted there: bootstrapped from, it
-        # drew policies out and grew without end. In its place the last reward, for ever.
-        for_ever = reward / jnp.maximum(1.0 - hyper["gamma"], MIN_DISCOUNTING)
-        next_value = jnp.where(batch.absorbed > 0, for_ever, next_value)
         mean = _apply(self.policy, params.policy, observation)
         log_pi = log_density(flat(batch.action), mean, self.sigma(state)).reshape(samples)
         log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
@@ -176,7 +170,7 @@ class Learner:
                 *trajectory, gamma=hyper["gamma"], lam=hyper["lam"], rho_bar=rho_bar, c_bar=c_bar
             )
         )(
-            reward,
+            hyper["reward_scale"] * batch.reward,
             jax.lax.stop_gradient(value),
             next_value,
             batch.terminated,

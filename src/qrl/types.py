@@ -15,7 +15,6 @@ class Transition(NamedTuple):
     next_observation: chex.Array  # [..., F] after the step, before any reset
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
-    absorbed: chex.Array  # [...] float 0 or 1: truncated by the environment itself, where nothing is learned any more
 
 
 class Networks(NamedTuple):
