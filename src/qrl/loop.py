@@ -194,4 +194,4 @@ class _Saver:
 
 def finished(out: Path, run: RunConfig) -> bool:
     """Whether the run in `out` has nothing left to do: its summaries are written last."""
-    return all((folder / "summary.json").exists() for folder in {out, *runs.members(out, run)})
+    return all((folder / "summary.json").is_file() for folder in {out, *runs.members(out, run)})
