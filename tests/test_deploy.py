@@ -56,7 +56,7 @@ def test_an_export_is_whole_and_the_same_again(run: Path, capsys: pytest.Capture
     assert contents(run / "export") == first
     assert {path.name for path in run.iterdir()} - {"export"} <= {
         *("config.json", "metrics.csv", "checkpoints", "tensorboard", "summary.json"),
-        *("learning_curve.png", "flight.png", "evaluation.json", "evaluation.png"),
+        *("lock", "learning_curve.png", "flight.png", "evaluation.json", "evaluation.png"),
     }
 
 
@@ -155,12 +155,12 @@ BROKEN = {
         lambda run: [shutil.rmtree(path) for path in (run / "checkpoints").iterdir() if path.is_dir()],
         "no checkpoint",
     ),
-    "half a checkpoint": (truncated, "the checkpoint at step 400 cannot be read"),
+    "half a checkpoint": (truncated, "checkpoints/400/"),
     "another format": (lambda run: altered(run, format=2), "key 'format'"),
     "not JSON": (lambda run: (run / "config.json").write_text('{"format": 1,'), "config.json"),
     "several seeds": (lambda run: altered(run, seeds=3), "holds 3 seeds; name one of them, such as RUN="),
-    "another network": (lambda run: altered(run, learner={"policy_hidden": [8]}), "another configuration"),
-    "one layer more": (lambda run: altered(run, learner={"policy_hidden": [4, 4]}), "cannot be read"),
+    "another network": (lambda run: altered(run, learner={"policy_hidden": [8]}), "of another run than config.json"),
+    "one layer more": (lambda run: altered(run, learner={"policy_hidden": [4, 4]}), "of another run than config.json"),
     "an activation": (lambda run: altered(run, learner={"activation": "gelu"}), "key 'learner.activation'"),
 }
 

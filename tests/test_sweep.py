@@ -91,7 +91,7 @@ def done(tmp_path_factory: pytest.TempPathFactory, compiled: list[str]) -> Path:
 def test_one_program_for_points_that_differ_in_traced_values(done: Path) -> None:
     """Step sizes and masses travel: training was compiled once, and so were its first state and evaluation."""
     names = json.loads((done.parent / "compiled.json").read_text())
-    for program in ("_init_all", "_advance_all", "_fly_all"):
+    for program in ("_init_all", "_advance_all", "_fly_evenly"):
         assert sum(program in name for name in names) == 1, names
 
 

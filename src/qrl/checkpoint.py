@@ -218,6 +218,7 @@ class Writer:
                 args=ocp.args.Composite(**{STATE: ocp.args.StandardSave(state)}),
                 force=True,
             )
+            self._still_there()  # removed meanwhile, Orbax has made it anew
             seal = _Seal(
                 run_sha256=self._run_sha256,
                 record=checkpoint.record,
