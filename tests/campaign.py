@@ -20,6 +20,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from qrl import checkpoint
+from qrl.seal import NAME
 
 TORTURE = os.environ.get("QRL_TORTURE") == "1"  # all of it, not a sample
 PATIENCE = 400.0  # seconds: whatever takes longer hangs
@@ -179,7 +180,7 @@ def killed_again_and_again(
         reached = max((steps[0] for steps in before if steps), default=0)
         process = start(*words, **changes)
         if happened == kills - 1:
-            wait_for(process, lambda: (folders[0] / "checkpoints" / str(whole_steps) / checkpoint.SEAL).exists())
+            wait_for(process, lambda: (folders[0] / "checkpoints" / str(whole_steps) / NAME).exists())
             wait_for(process, lambda: False, draw.uniform(0.0, 0.5))
         else:
             ahead = reached / whole_steps > (happened + 1) / kills

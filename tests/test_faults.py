@@ -19,7 +19,8 @@ import campaign
 from campaign import REPORTS, STEPS, TORTURE, TRAIN, Ended
 from frontdoor import qrl
 from qrl import checkpoint, laps, processes, restore
-from qrl.checkpoint import Checkpoint, Damaged, Foreign, Record
+from qrl.checkpoint import Checkpoint
+from qrl.seal import FORMAT, NAME, Damaged, Foreign, Record
 from qrl.train import Trainer, TrainState, point, stack
 from qrl_envs import env as worlds
 from test_loop import run_config, train
@@ -125,14 +126,14 @@ def test_damaged_checkpoint_is_found_and_the_one_before_used(
     """Every file of the newest one: named in a note, the rest set aside as it is, the one before restored."""
     last, before = checkpoint.steps(small)[:2]
     names = files(newest(small))
-    for name in names if TORTURE else {*names[DAMAGE.index(how) :: 4], checkpoint.SEAL}:
+    for name in names if TORTURE else {*names[DAMAGE.index(how) :: 4], NAME}:
         run = copy(small, tmp_path / "run")
         victim = newest(run) / name
         if does_nothing(how, victim):
             continue
         how(victim)
         FAULTS.append(f"{how.__name__} {name}")
-        left = campaign.digest(newest(run)) if name != checkpoint.SEAL or how != Path.unlink else None
+        left = campaign.digest(newest(run)) if name != NAME or how != Path.unlink else None
         notes = assert_restores(run, before, like, small)
         assert str(last) not in [path.name for path in (run / "checkpoints").iterdir()]
         if left is not None:  # what has no seal counts for nothing, and needs no word
@@ -149,7 +150,7 @@ def test_all_damaged_starts_afresh(tmp_path: Path, small: Path, like: TrainState
     """It is said of each, and what there is stays, set aside."""
     run = copy(small, tmp_path / "run")
     for i, env_steps in enumerate(checkpoint.steps(run)):
-        DAMAGE[i % 3](run / "checkpoints" / str(env_steps) / checkpoint.SEAL)
+        DAMAGE[i % 3](run / "checkpoints" / str(env_steps) / NAME)
         FAULTS.append(f"all damaged: {env_steps}")
     found = restore.latest([run], [run_config()], like)
     assert (found.env_steps, found.states, found.records) == (0, None, [])
@@ -163,8 +164,8 @@ def test_newest_step_that_is_whole_for_all_seeds_is_used(tmp_path: Path, small: 
     """One seed lacks the last, the other's last but one is damaged: both go on from the one before these."""
     first, second = copy(small, tmp_path / "first"), copy(small, tmp_path / "second")
     last, other, both = checkpoint.steps(small)[:3]
-    (first / "checkpoints" / str(last) / checkpoint.SEAL).unlink()
-    flip(second / "checkpoints" / str(other) / checkpoint.SEAL)
+    (first / "checkpoints" / str(last) / NAME).unlink()
+    flip(second / "checkpoints" / str(other) / NAME)
     FAULTS.extend(["no seal of one seed", "damage of the other"])
     pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype), like)
     found = restore.latest([first, second], [run_config()] * 2, pair)
@@ -178,7 +179,7 @@ def test_newest_step_that_is_whole_for_all_seeds_is_used(tmp_path: Path, small: 
 def test_killed_while_a_checkpoint_is_removed(tmp_path: Path, small: Path, like: TrainState) -> None:
     """Any number of its files are gone, the seal first or not: it is passed over."""
     before = checkpoint.steps(small)[1]
-    names = [checkpoint.SEAL, *[name for name in files(newest(small)) if name != checkpoint.SEAL]]
+    names = [NAME, *[name for name in files(newest(small)) if name != NAME]]
     for order in (names, names[::-1]):
         for count in range(1, len(names) + 1, 1 if TORTURE else 3):
             run = copy(small, tmp_path / "run")
@@ -315,11 +316,11 @@ def put(data: Any, at: tuple[Any, ...], value: Any) -> Any:
 
 @functools.cache
 def sealed(victim: Path) -> bytes:
-    return (victim / "checkpoints" / "7" / checkpoint.SEAL).read_bytes()
+    return (victim / "checkpoints" / "7" / NAME).read_bytes()
 
 
 def with_seal(victim: Path, data: bytes) -> bool:
-    path = victim / "checkpoints" / "7" / checkpoint.SEAL
+    path = victim / "checkpoints" / "7" / NAME
     original = sealed(victim)
     path.write_bytes(data)
     try:
@@ -386,7 +387,7 @@ def test_seal_of_great_depth(victim: Path, depth: int, begin: str) -> None:
 def test_other_files_of_other_bytes(victim: Path, data: st.DataObject) -> None:
     """Not one of them reaches Orbax."""
     path = victim / "checkpoints" / "7"
-    name = data.draw(st.sampled_from([name for name in files(path) if name != checkpoint.SEAL]))
+    name = data.draw(st.sampled_from([name for name in files(path) if name != NAME]))
     original = (path / name).read_bytes()
     changed = mutated(data.draw, original)
     (path / name).write_bytes(changed)
@@ -443,9 +444,9 @@ def test_resume_of_something_else_touches_nothing(
 
 def test_checkpoint_of_a_later_format_touches_nothing(capfd: pytest.CaptureFixture[str], stopped: Path) -> None:
     """This version must not read it, and must not take it for a damaged one either."""
-    seal = newest(stopped) / checkpoint.SEAL
+    seal = newest(stopped) / NAME
     data = json.loads(seal.read_text())
-    seal.write_text(json.dumps({**data, "format": checkpoint.FORMAT + 1, "more": []}))
+    seal.write_text(json.dumps({**data, "format": FORMAT + 1, "more": []}))
     before = campaign.digest(stopped)
     FAULTS.append("later format")
     assert "later version of qrl (format 2" in refused(capfd, *TRAIN, "--out", stopped, "--resume")

@@ -2,13 +2,9 @@
 
 import copy
 import json
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
 
 from qrl_envs import task
 from qrl_envs.specfile import BadInput
@@ -251,79 +247,3 @@ def test_a_folder_is_not_a_task(tmp_path: Path) -> None:
     folder.mkdir()
     with pytest.raises(BadInput, match=r"folder\.json: cannot be read"):
         task.load(str(folder))
-
-
-def places(spec: Any, at: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """The path of every value inside a JSON value, itself included."""
-    yield at
-    inside = spec.items() if isinstance(spec, dict) else enumerate(spec) if isinstance(spec, list) else ()
-    for key, value in inside:
-        yield from places(value, (*at, key))
-
-
-def keys(spec: Any) -> set[str]:
-    return {key for at in places(spec) for key in at if isinstance(key, str)}
-
-
-PLACES = [(name, at) for name, spec in SHIPPED.items() for at in places(spec) if at]
-NAMES = st.sampled_from(sorted({"extend", *(key for spec in SHIPPED.values() for key in keys(spec))})) | st.text()
-LEAVES = (
-    st.none()
-    | st.booleans()
-    | st.integers()
-    | st.floats()
-    | st.text()
-    | st.sampled_from(["hover", "circle", "pendulum", "quadrotor", 1e-300, 1e300, 2**70])
-)
-VALUES = st.recursive(
-    LEAVES, lambda inner: st.lists(inner, max_size=4) | st.dictionaries(NAMES, inner, max_size=4), max_leaves=12
-)
-fuzz = settings(max_examples=250, deadline=None, derandomize=True, database=None)
-
-
-def loads_or_says_why(path: Path, text: str | bytes) -> None:
-    try:
-        load(path, text)
-    except BadInput as error:
-        line = str(error)
-        assert line.startswith(f"{path}: ")
-        assert len(line.splitlines()) == 1
-
-
-@fuzz
-@given(VALUES)
-@example({"extend": "hover", "\n": 0})
-@example({"extend": "\r"})
-def test_any_json_loads_or_is_bad_input(path: Path, value: Any) -> None:
-    """Nothing else is raised, and the message is one line that begins with the file."""
-    loads_or_says_why(path, json.dumps(value))
-
-
-@fuzz
-@given(st.sampled_from(PLACES), VALUES)
-@example(("hover", ("vehicle", "mass_kg")), "\ud800")
-def test_a_shipped_task_with_any_value_anywhere_loads_or_is_bad_input(
-    path: Path, place: tuple[str, tuple[str | int, ...]], value: Any
-) -> None:
-    """The same, close to what is valid: one value of a whole task replaced."""
-    name, (*above, last) = place
-    spec = copy.deepcopy(SHIPPED[name])
-    inner = spec
-    for key in above:
-        inner = inner[key]
-    inner[last] = value
-    loads_or_says_why(path, json.dumps(spec))
-
-
-@fuzz
-@given(st.sampled_from(sorted(SHIPPED)), st.dictionaries(NAMES, VALUES, max_size=3))
-def test_anything_laid_over_a_shipped_task_loads_or_is_bad_input(path: Path, name: str, over: dict[str, Any]) -> None:
-    """The same, through `extend`."""
-    loads_or_says_why(path, json.dumps(over | {"extend": name}))
-
-
-@fuzz
-@given(st.binary(max_size=40) | st.text(alphabet='{}[]:,"0123456789eE+-.\\u \n', max_size=40).map(str.encode))
-def test_any_bytes_load_or_are_bad_input(path: Path, text: bytes) -> None:
-    """The same for files that are hardly JSON."""
-    loads_or_says_why(path, text)

@@ -1,65 +1,32 @@
 """Checkpoints of the whole training state of one run folder, written beside the training by Orbax.
 
-A checkpoint is whole once it has a seal: a file, written last, with the SHA-256 of every other file. Whoever reads
-checks the seal first, so that nothing damaged ever reaches Orbax; what has no seal was being written when the process
-was killed, and counts for nothing.
+A checkpoint is whole once it has its seal. Whoever reads checks that first, so that nothing damaged ever reaches Orbax;
+what has no seal was being written when the process was killed, and counts for nothing.
 """
 
 import ctypes
-import hashlib
-import json
-import math
 import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
-from pydantic import BaseModel, ConfigDict, ValidationError
 
-from qrl.runs import Row, RunConfig, replace_text
+from qrl import seal
+from qrl.runs import Row, RunConfig, comparable
+from qrl.seal import Damaged, Foreign, Record, first_line
 
 KEEP = 5  # the last so many, and the best
-FORMAT: Literal[1] = 1
-SEAL = "seal.json"
 ROOM = "room.tmp"
 STATE = "state"
 # Whoever calls Orbax does so alone: it must not wait for other processes of the run.
 _ONE_PROCESS = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0}, barrier_sync_key_prefix="qrl")
-
-
-class Record(BaseModel):
-    """What a checkpoint holds besides the training state."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
-
-    rows: list[Row]  # of metrics.csv, up to here
-    train_seconds: float
-    report_seconds: float  # of these, since the last report
-
-
-class _Seal(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
-
-    format: Literal[1] = FORMAT
-    run_sha256: str  # whose it is
-    record: Record
-    record_sha256: str
-    sha256: dict[str, str]  # of each file, by its path in the checkpoint
-
-
-class Damaged(OSError):
-    """A checkpoint is not what was written; the message says which file of which."""
-
-
-class Foreign(OSError):
-    """A checkpoint is whole, and not one of this run, or of another version of qrl."""
 
 
 class Checkpoint(NamedTuple):
@@ -70,7 +37,7 @@ class Checkpoint(NamedTuple):
 
 def steps(folder: Path) -> list[int]:
     """The environment steps at which a run folder has sealed checkpoints, newest first."""
-    return sorted(int(path.parent.name) for path in _root(folder).glob(f"*/{SEAL}") if _is_step(path.parent))[::-1]
+    return sorted(int(path.parent.name) for path in _root(folder).glob(f"*/{seal.NAME}") if _is_step(path.parent))[::-1]
 
 
 def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
@@ -79,17 +46,17 @@ def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
     Raises Damaged where the files are not those that were sealed, Foreign where they are of another run or version.
     """
     path = _root(folder) / str(env_steps)
-    seal = _checked(path)
-    if seal.run_sha256 != run.sha256:
+    whole = seal.checked(path)
+    if whole.run_sha256 != run.sha256:
         raise Foreign(f"{path}: of another run than config.json (another task, hyperparameter, seed or version of qrl)")
     wanted = _by_name(like)
     try:
         with ocp.StandardCheckpointer(multiprocessing_options=_ONE_PROCESS) as orbax:
             found = orbax.restore((path / STATE).resolve(), wanted)
     except OSError as error:
-        raise Damaged(f"{path}: cannot be read ({_first(error)})") from None
+        raise Damaged(f"{path}: cannot be read ({first_line(error)})") from None
     except (ValueError, KeyError, TypeError) as error:
-        raise Foreign(f"{path}: of another version of qrl ({_first(error)})") from None
+        raise Foreign(f"{path}: of another version of qrl ({first_line(error)})") from None
     for name, leaf in wanted.items():  # Orbax hands back whatever it finds
         if (found[name].shape, found[name].dtype) != (leaf.shape, leaf.dtype):
             raise Foreign(
@@ -97,7 +64,7 @@ def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
                 f" not {leaf.dtype}{list(leaf.shape)})"
             )
     state = jax.tree.unflatten(jax.tree.structure(like), [np.asarray(found[name]) for name in wanted])
-    return Checkpoint(env_steps, state, seal.record)
+    return Checkpoint(env_steps, state, whole.record)
 
 
 def _by_name(tree: Any) -> dict[str, Any]:
@@ -105,48 +72,20 @@ def _by_name(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): x for path, x in jax.tree.leaves_with_path(tree)}
 
 
-def _checked(path: Path) -> _Seal:
-    """The seal of a checkpoint whose every file is as it was sealed."""
-    try:
-        text = (path / SEAL).read_bytes()
-        version = json.loads(text)
-    except (OSError, ValueError, RecursionError) as error:
-        raise Damaged(f"{path}/{SEAL}: cannot be read ({_first(error)})") from None
-    if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found > FORMAT:
-        raise Foreign(f"{path}: of a later version of qrl (format {str(found)[:20]}; this one reads {FORMAT})")
-    try:
-        seal = _Seal.model_validate_json(text)
-    except ValidationError as error:
-        raise Damaged(f"{path}/{SEAL}: is damaged ({error.errors()[0]['msg']})") from None
-    if _record_sha256(seal.record) != seal.record_sha256:
-        raise Damaged(f"{path}/{SEAL}: is damaged")
-    found = set(_files(path))
-    for name, digest in seal.sha256.items():
-        if name not in found:
-            raise Damaged(f"{path}: {json.dumps(name)[:120]} is missing")
-        try:
-            same = _sha256(path / name) == digest
-        except OSError as error:
-            raise Damaged(f"{path}/{name}: cannot be read ({_first(error)})") from None
-        if not same:
-            raise Damaged(f"{path}/{name}: is damaged")
-    return seal
-
-
 def clear_after(folder: Path, env_steps: int) -> None:
     """Leave no checkpoint after `env_steps`: what is whole or was never sealed goes, what is damaged is set aside."""
     for path in sorted(_root(folder).glob("*")):
         if not _is_step(path) or int(path.name) <= env_steps:
             continue
-        if (path / SEAL).exists():
+        if (path / seal.NAME).exists():
             try:
-                _checked(path)
+                seal.checked(path)
             except (Damaged, Foreign):
                 aside = path.with_name(f"aside-{path.name}")
                 shutil.rmtree(aside, ignore_errors=True)
                 path.rename(aside)
                 continue
-            (path / SEAL).unlink()  # first: killed half-way, what is left is no checkpoint
+            (path / seal.NAME).unlink()  # first: killed half-way, what is left is no checkpoint
         shutil.rmtree(path)
 
 
@@ -219,24 +158,18 @@ class Writer:
                 force=True,
             )
             self._still_there()  # removed meanwhile, Orbax has made it anew
-            seal = _Seal(
-                run_sha256=self._run_sha256,
-                record=checkpoint.record,
-                record_sha256=_record_sha256(checkpoint.record),
-                sha256={name: _sha256(path / name, on_disk=True) for name in _files(path)},
-            )
-            for inside in (path, *(place for place in path.rglob("*") if place.is_dir())):
-                _sync(inside)
-            replace_text(path / SEAL, seal.model_dump_json() + "\n")
+            seal.close(path, self._run_sha256, checkpoint.record)
             _give_back()
         except (OSError, ValueError) as error:  # ValueError: how Orbax reports a full disk
-            raise OSError(f"{path}: the checkpoint could not be written ({_first(error)})") from None
+            raise OSError(f"{path}: the checkpoint could not be written ({first_line(error)})") from None
 
     def _best(self, among: Sequence[int]) -> int | None:
         """Of these steps the one whose report was best; None where none had a report."""
         reports = {row["env_steps"]: row for row in self._rows}
         ranks = {
-            step: (_number(row["success"]), _number(row["return_mean"])) for step in among if (row := reports.get(step))
+            step: (comparable(row["success"]), comparable(row["return_mean"]))
+            for step in among
+            if (row := reports.get(step))
         }
         return max(ranks, key=lambda step: ranks[step], default=None)
 
@@ -274,38 +207,5 @@ def _give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _number(value: float) -> float:
-    """For comparisons, in which NaN (not measured) has no place."""
-    return float("-inf") if math.isnan(value) else value
-
-
 def _is_step(path: Path) -> bool:
     return path.name.isdecimal() and path.is_dir()
-
-
-def _files(path: Path) -> list[str]:
-    return sorted(str(f.relative_to(path)) for f in path.rglob("*") if f.is_file() and f.name != SEAL)
-
-
-def _sha256(path: Path, *, on_disk: bool = False) -> str:
-    with path.open("rb") as file:
-        if on_disk:  # a seal that outlives a crash must not vouch for what did not; Orbax leaves it to the system
-            os.fsync(file.fileno())
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _sync(folder: Path) -> None:
-    at = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(at)
-    finally:
-        os.close(at)
-
-
-def _record_sha256(record: Record) -> str:
-    return hashlib.sha256(record.model_dump_json().encode()).hexdigest()
-
-
-def _first(error: Exception) -> str:
-    text = (isinstance(error, OSError) and error.strerror) or str(error).strip()
-    return text.split("\n")[0][:120]

@@ -28,7 +28,6 @@ from qrl.learner import MAX_NORMALISED
 from qrl.policy import Acted, Observed, Origin, Policy
 from qrl.train import point, stack
 from qrl_envs import ports
-from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
 
 EVALUATION_STARTS_SEED = 1_000_003  # other starts than the reports'
@@ -54,8 +53,7 @@ class Run:
             self.trainer, self.state, self.env_steps = restore.last(self.env, self.config, folder)
         except OSError as error:
             raise BadInput(str(error)) from None
-        spec = self.config.task.spec
-        self._task = tasks.from_data(spec, self.config.task.name) if spec else None
+        self._task = request.spec(self.config.task) if self.config.task.spec else None
         self._fly = jax.jit(self._flights, static_argnums=0)
 
     def fly(self, starts: chex.PRNGKey) -> Flights:

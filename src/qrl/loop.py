@@ -10,10 +10,11 @@ import numpy as np
 from brax.envs.base import Env
 
 from qrl import checkpoint, peers, restore, runs
-from qrl.checkpoint import Checkpoint, Record
+from qrl.checkpoint import Checkpoint
 from qrl.evaluate import Flights
 from qrl.laps import Clock, Lap, Programs, compile_advance, compile_fly, laps, report_starts, seeds
 from qrl.runs import Row, RunConfig
+from qrl.seal import Record
 from qrl.tensorboard import EventLog
 from qrl.train import Trainer, point, spread, stack
 

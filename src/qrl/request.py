@@ -54,7 +54,13 @@ def environment(record: TaskRecord) -> Env:
     """The Brax environment of a recorded task."""
     if record.spec is None:
         return envs.get_environment(record.name)
-    return worlds.from_task(tasks.from_data(record.spec, record.name))
+    return worlds.from_task(spec(record))
+
+
+def spec(record: TaskRecord) -> tasks.Task:
+    """The task of a record of one of our own worlds."""
+    assert record.spec is not None
+    return tasks.from_data(record.spec, record.name)
 
 
 def config_file(path: Path | None) -> ConfigFile:
@@ -98,7 +104,7 @@ def run_config(
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=runs.versions(),
-        devices=here_devices(),
+        devices=device_names(),
     )
     return _countable(run, str(config or "command line"))
 
@@ -179,12 +185,13 @@ def changed_since(run: RunConfig) -> str:
         for name in names
         if run.versions.get(name) != now.get(name)
     ]
-    if (here := here_devices()) != run.devices:
+    if (here := device_names()) != run.devices:
         changed.append(f"devices were {', '.join(run.devices)}, are {', '.join(here)}")
     return "; ".join(changed)
 
 
-def here_devices() -> list[str]:
+def device_names() -> list[str]:
+    """Those of all processes."""
     return [str(device) for device in jax.devices()]
 
 

@@ -7,8 +7,8 @@ import jax
 from brax.envs.base import Env
 
 from qrl import checkpoint, laps
-from qrl.checkpoint import Damaged, Record
 from qrl.runs import RunConfig
+from qrl.seal import Damaged, Record
 from qrl.train import Point, Trainer, TrainState, point, stack
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from qrl import runs
 from qrl.grid import Grid
-from qrl.runs import RunConfig
+from qrl.runs import RunConfig, comparable
 from qrl.sweep import Result
 
 CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
@@ -93,11 +93,7 @@ def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | 
 
 def _rank(finding: Finding) -> tuple[bool, float, float]:
     alive = finding["diverged"] < finding["seeds"]
-    return alive, _number(finding["success"]["median"]), _number(finding["return_mean"]["median"])
-
-
-def _number(value: float) -> float:
-    return -math.inf if math.isnan(value) else value  # not measured
+    return alive, comparable(finding["success"]["median"]), comparable(finding["return_mean"]["median"])
 
 
 def ranked(found: list[Finding]) -> list[Finding]:
@@ -109,7 +105,7 @@ def repeat(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
     """The run of a point with its middle seed: the lower median, of those that did not diverge."""
     first = point * len(grid.seeds)
     last = {j: results[first + j].rows[-1] for j in range(len(grid.seeds)) if not results[first + j].diverged}
-    order = sorted(last, key=lambda j: (_number(last[j]["success"]), _number(last[j]["return_mean"])))
+    order = sorted(last, key=lambda j: (comparable(last[j]["success"]), comparable(last[j]["return_mean"])))
     return RunConfig(
         task=grid.points[point].task,
         learner=grid.points[point].learner,

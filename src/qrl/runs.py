@@ -179,6 +179,11 @@ def _number(cell: str) -> float | int:
     return int(number) if abs(number) < 2**53 and cell.lstrip("-").isdigit() else number
 
 
+def comparable(value: float) -> float:
+    """For rankings: what was not measured, or is no number, is the worst."""
+    return -math.inf if math.isnan(value) else value
+
+
 def write_metrics(folder: Path, rows: list[Row]) -> None:
     """Write metrics.csv anew: a few dozen rows, and so it is never half-written. Without a row there is none."""
     if not rows:

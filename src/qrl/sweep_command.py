@@ -113,8 +113,8 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
 
 def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
     if not held and process.number == 0:
-        devices = [str(device) for device in jax.devices()]
-        runs.write_json(out / "grid.json", {**grid.record, "versions": runs.versions(), "devices": devices})
+        here = {"versions": runs.versions(), "devices": request.device_names()}
+        runs.write_json(out / "grid.json", {**grid.record, **here})
 
 
 def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
