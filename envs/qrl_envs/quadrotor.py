@@ -104,6 +104,16 @@ def step(physics: Physics, body: Body, thrust: chex.Array, dt_s: float) -> Body:
     return body._replace(pose=body.pose._replace(attitude=rotation.normalise(body.pose.attitude)))
 
 
+def step_finely(physics: Physics, body: Body, thrust: chex.Array, dt_s: float, parts: int) -> Body:
+    """The same control period by RK4 in so many equal parts: closer to the true motion than `step`."""
+
+    def part(_: int, body: Body) -> Body:
+        body = integrate.rk4(lambda b: derivative(physics, b, thrust), body, dt_s / parts)
+        return body._replace(pose=body.pose._replace(attitude=rotation.normalise(body.pose.attitude)))
+
+    return jax.lax.fori_loop(0, parts, part, body)
+
+
 def observe(body: Body) -> chex.Array:
     """[18]: rotation matrix body -> world row-major, position [m], velocity [m/s] (world), body rates [rad/s]."""
     return jnp.concatenate([rotation.matrix(body.pose.attitude).reshape(9), body.pose.position_m, *body.twist])

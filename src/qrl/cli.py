@@ -78,6 +78,10 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts", allow_abbrev=False)
     evaluate.add_argument("run", type=Path, help="run folder", metavar="RUN")
     evaluate.add_argument("--starts", type=count, default=1000, help="how many starts (1000)", metavar="N")
+    evaluate.add_argument(
+        "--off-nominal", action="store_true", help="also under RK4, latency, sensor noise; hover: the paper's trial"
+    )
+    evaluate.add_argument("--checkpoints", type=count, default=1, help="the last so many checkpoints (1)", metavar="K")
 
     export = commands.add_parser("export", help="emit a trained policy as a C kernel, proved", allow_abbrev=False)
     export.add_argument("run", type=Path, help="run folder", metavar="RUN")

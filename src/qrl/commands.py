@@ -1,27 +1,20 @@
-"""The commands behind the command line: evaluate, export, tasks; train and sweep have modules of their own."""
+"""The commands behind the command line: export and tasks; train, evaluate and sweep have modules of their own."""
 
 import argparse
 import os
 import sys
 import time
 import traceback
-from typing import Any
 
 import jax
-import numpy as np
 
-from qrl import deploy, loop, request, restore, runs, sweep_command, train_command
-from qrl.deploy import EVALUATION_STARTS_SEED
-from qrl.evaluate import summarise
+from qrl import deploy, evaluate_command, loop, request, sweep_command, train_command
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.export.kernel import PossibleOverflow
 from qrl.export.report import gates
 from qrl.export.targets import ProofFailed
-from qrl.runs import RunConfig
 from qrl.seal import Foreign
 from qrl.terminal import clock, console
-from qrl.train import point, stack
-from qrl_envs import picture
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
 
@@ -30,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
     commands = {
         "train": train_command.train,
-        "evaluate": evaluate,
+        "evaluate": evaluate_command.evaluate,
         "export": export,
         "sweep": sweep_command.sweep,
         "tasks": list_tasks,
@@ -71,51 +64,6 @@ def list_tasks(_: argparse.Namespace) -> int:
     console.print(f"\nBrax's own: {', '.join(request.foreign_tasks())}")
     console.print("Your own: a .json file that extends one of the first, such as experiments/vehicles/crazyflie.json")
     return DONE
-
-
-# -- evaluate ------------------------------------------------------------------------------------------------
-
-
-def evaluate(args: argparse.Namespace) -> int:
-    """Fly every seed of a run from fresh starts; print a table, leave evaluation.json and a plot in each folder."""
-    config = request.stored(args.run)
-    env = request.environment(config.task)
-    starts = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), args.starts)
-    table: list[dict[str, Any]] = []
-    for i, folder in enumerate(runs.members(args.run, config)):
-        try:
-            trainer, state, env_steps = restore.last(env, config.member(i), folder)
-        except OSError as error:
-            raise BadInput(str(error)) from None
-        flights = jax.tree.map(lambda x: x[0], trainer.fly(state.learner, stack([point(env, config.learner)]), starts))
-        result = {"seed": config.seed + i, "env_steps": env_steps, "starts": args.starts, **summarise(flights)}
-        runs.write_json(folder / "evaluation.json", result)
-        if config.task.spec:
-            picture.errors(folder / "evaluation.png", request.spec(config.task), np.asarray(flights.observations))
-        table.append(result)
-    if config.seeds > 1:
-        runs.write_json(args.run / "evaluation.json", table)
-    _print_results(table, config)
-    return DONE
-
-
-def _print_results(table: list[dict[str, Any]], config: RunConfig) -> None:
-    console.print(f"{config.task.name}: {table[0]['starts']:,} fresh starts, deterministic policy")
-    names = [name for name in table[0] if name not in ("seed", "starts") and not _missing(table[0][name])]
-    width = max(len(name) for name in names)
-    console.print(f"{'seed':<{width}} " + " ".join(f"{row['seed']:>11}" for row in table))
-    for name in names:
-        console.print(f"{name:<{width}} " + " ".join(f"{_cell(name, row[name]):>11}" for row in table))
-
-
-def _missing(value: Any) -> bool:
-    return isinstance(value, float) and np.isnan(value)
-
-
-def _cell(name: str, value: float) -> str:
-    if name == "env_steps":
-        return f"{value:,}"
-    return f"{value:.2f}" if name.startswith("return") else f"{value:.4f}"
 
 
 # -- export --------------------------------------------------------------------------------------------------

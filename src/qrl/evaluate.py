@@ -29,15 +29,16 @@ def fly(
     """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
 
     `env` is the training environment; one with an `evaluation` (ours) is flown and measured as that says,
-    another for one episode of `longest` steps. `begin` draws the starts. A flight that ends early has nothing
-    more to observe: its NaNs make it a failure wherever it ended.
+    another for one episode of `longest` steps. `begin` draws the starts. Where sensors err, `info["sensed"]` is what
+    the policy sees; what is measured is the true observation. A flight that ends early has nothing more to observe:
+    its NaNs make it a failure wherever it ended.
     """
     plan = getattr(env, "evaluation", lambda: None)()
     env, steps, return_steps, measure = plan or (env, longest, longest, None)
 
     def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
         state, total = carry
-        action = jnp.clip(mean(state.obs), -1.0, 1.0)
+        action = jnp.clip(mean(state.info.get("sensed", state.obs)), -1.0, 1.0)
         after = jax.vmap(env.step)(state, action)
         over = state.done.astype(bool)
         total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)

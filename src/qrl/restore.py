@@ -1,5 +1,6 @@
 """From a run folder's checkpoints back to a training state: to go on with, or to look at."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,12 +58,22 @@ def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState, i
     Raises FileNotFoundError, naming the folder, where there is none; OSError where it is not whole: whoever flies a
     policy should not be given an earlier one unasked.
     """
+    trainer = Trainer(env, run.learner)
+    return trainer, *next(newest(trainer, run, folder, 1))
+
+
+def newest(trainer: Trainer, run: RunConfig, folder: Path, most: int) -> Iterator[tuple[TrainState, int]]:
+    """State and environment steps, as from `last`, of a seed's checkpoints, newest first, of at most so many.
+
+    Each is read when it is asked for, and raises as `last` does.
+    """
     saved = checkpoint.steps(folder)
     if not saved:
         raise FileNotFoundError(f"{folder}: no checkpoint")
-    trainer = Trainer(env, run.learner)
-    found = checkpoint.read(folder, run, saved[0], _one(shapes(trainer, stack([point(env, run.learner)]))))
-    return trainer, trainer.place(stack([found.state])), found.env_steps
+    like = _one(shapes(trainer, stack([point(trainer.env, run.learner)])))
+    for env_steps in saved[:most]:
+        found = checkpoint.read(folder, run, env_steps, like)
+        yield trainer.place(stack([found.state])), found.env_steps
 
 
 def _one(states: Any) -> Any:

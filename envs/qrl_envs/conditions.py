@@ -1,0 +1,110 @@
+"""Flights under other conditions than those that a policy trains in: plant, latency, sensors, start.
+
+An `OffNominal` environment is the task's own but for its condition, and judged as the task is, on the true state. What
+a policy sees where sensors err stands in `info["sensed"]`, beside the true `obs`. Sizes are of the project's own bar,
+the trial's start is the paper's (its figure of a hovering trial).
+"""
+
+from typing import NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+from brax.envs.base import State
+
+from qrl_envs import quadrotor, rotation
+from qrl_envs.env import Params, QuadrotorEnv
+from qrl_envs.quadrotor import Body, Physics, Pose, Twist
+from qrl_envs.task import QuadrotorTask
+
+FINE_STEP_S = 0.001
+TRIAL_POSITION_M = (-1.58, 0.99, 1.45)  # world
+TRIAL_VELOCITY_M_S = (-2.39, 6.20, 0.77)  # world
+_SENSORS = 1_000_003  # folded into a start's key: another stream than the start's own numbers
+
+
+class Noise(NamedTuple):
+    """Standard deviations of Gaussian errors, each axis' own, fresh at every step."""
+
+    position_m: float = 0.01
+    velocity_m_s: float = 0.02
+    attitude_rad: float = 0.01  # of a small rotation about the body's axes
+    body_rate_rad_s: float = 0.02
+
+
+class Condition(NamedTuple):
+    """How a flight differs from the nominal one; by default not at all."""
+
+    says: str  # in a line
+    fine: bool = False  # the plant integrated by RK4 in steps of FINE_STEP_S
+    late: bool = False  # an action acts one step late; in the first step a = 0 does, hover thrust
+    noise: Noise | None = None
+    trial: bool = False  # position and velocity at the start are the paper's trial's
+
+
+def conditions(task: QuadrotorTask) -> dict[str, Condition]:
+    """Off-nominal conditions by name; the paper's trial is a start of a hover."""
+    named = {
+        "rk4": Condition("plant integrated by RK4 at 1 ms", fine=True),
+        "latency": Condition("actions one step late", late=True),
+        "noise": Condition("sensors err by 1 cm, 2 cm/s, 0.01 rad, 0.02 rad/s (1 σ, each axis)", noise=Noise()),
+        "together": Condition("rk4, latency and noise", fine=True, late=True, noise=Noise()),
+    }
+    if task.evaluation.reward.form == "hover":
+        named["trial"] = Condition("the paper's trial: its position and velocity, any attitude", trial=True)
+    return named
+
+
+class OffNominal(QuadrotorEnv):
+    """A quadrotor task under a condition. The same key gives the nominal start, but for what the condition sets."""
+
+    def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
+        super().__init__(task)
+        self._condition = condition
+
+    def step(self, state: State, action: chex.Array) -> State:
+        info = dict(state.info)
+        if self._condition.late:
+            action, info["waiting"] = info["waiting"], action
+        return self._sense(super().step(state.replace(info=info), action))
+
+    def _begin(self, params: Params, rng: chex.PRNGKey) -> State:
+        state = super()._begin(params, rng)
+        info = dict(state.info)
+        if self._condition.late:
+            info["waiting"] = jnp.zeros(self.action_size)
+        if self._condition.noise:
+            info["sensor_key"] = jax.random.fold_in(rng, _SENSORS)
+        return self._sense(state.replace(info=info))
+
+    def _draw(self, params: Params, rng: chex.PRNGKey) -> Body:
+        body = super()._draw(params, rng)
+        if not self._condition.trial:
+            return body
+        position, velocity = jnp.array(TRIAL_POSITION_M), jnp.array(TRIAL_VELOCITY_M_S)
+        return Body(body.pose._replace(position_m=position), body.twist._replace(velocity_m_s=velocity))
+
+    def _move(self, physics: Physics, x: Body, thrust: chex.Array) -> Body:
+        if not self._condition.fine:
+            return super()._move(physics, x, thrust)
+        dt_s = self.task.control_period_s
+        return quadrotor.step_finely(physics, x, thrust, dt_s, max(1, round(dt_s / FINE_STEP_S)))
+
+    def _sense(self, state: State) -> State:
+        if not self._condition.noise:
+            return state
+        later, now = jax.random.split(state.info["sensor_key"])
+        measured = erring(state.pipeline_state.x, self._condition.noise, now)
+        return state.replace(info={**state.info, "sensor_key": later, "sensed": quadrotor.observe(measured)})
+
+
+def erring(body: Body, noise: Noise, key: chex.PRNGKey) -> Body:
+    """`body` as sensors with that noise measure it."""
+    position, velocity, tilt, rate = jax.random.normal(key, (4, 3))
+    # The rotation of a small vector, but for 1e-5 of its angle; a rotation exactly.
+    small = rotation.normalise(jnp.concatenate([jnp.ones(1), noise.attitude_rad / 2 * tilt]))
+    (p, q), (v, w) = body
+    return Body(
+        Pose(p + noise.position_m * position, rotation.product(q, small)),
+        Twist(v + noise.velocity_m_s * velocity, w + noise.body_rate_rad_s * rate),
+    )
