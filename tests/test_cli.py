@@ -44,6 +44,48 @@ def test_evaluate_writes_its_table(trained: Path, capsys: pytest.CaptureFixture[
     assert (trained / "evaluation.png").exists()
 
 
+def test_evaluate_flies_the_last_checkpoints(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A column for each, newest first, as many as asked for; one of them that is damaged is said so."""
+    run = shutil.copytree(trained, tmp_path / "run")
+    kept = sorted((int(path.name) for path in (run / "checkpoints").iterdir()), reverse=True)
+    assert len(kept) > 1
+    assert qrl("evaluate", run, "--starts", "5", "--checkpoints", "9") == 0
+    result = json.loads((run / "evaluation.json").read_text())
+    assert [each["env_steps"] for each in result["checkpoints"]] == kept
+    assert result["checkpoints"][0].items() <= result.items()
+    assert result["checkpoints"][1]["return_mean"] != result["return_mean"]
+    assert all(f"{env_steps:,}" in capsys.readouterr().out for env_steps in kept[:1])
+    victim = next(path for path in (run / "checkpoints" / str(kept[1])).rglob("*") if path.name == "_METADATA")
+    victim.write_bytes(victim.read_bytes() + b" ")
+    assert f"checkpoints/{kept[1]}" in complaint(capsys, "evaluate", run, "--starts", "5", "--checkpoints", "2")
+    assert qrl("evaluate", run, "--starts", "5") == 0
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every seed, with a table for each; what is nominal is said as without the flag."""
+    task, run = tmp_path / "short.json", tmp_path / "run"
+    task.write_text('{"extend": "circle", "evaluation": {"duration_s": 0.3, "tail_s": 0.1}}')
+    assert qrl("train", task, "--out", run, "--seeds", "2", *TINY.split()) == 0
+    assert qrl("evaluate", run, "--starts", "5") == 0
+    plain = [json.loads((run / f"seed-{i}" / "evaluation.json").read_text()) for i in range(2)]
+    capsys.readouterr()
+    assert qrl("evaluate", run, "--starts", "5", "--off-nominal") == 0
+    said = capsys.readouterr().out
+    for i, before in enumerate(plain):
+        result = json.loads((run / f"seed-{i}" / "evaluation.json").read_text())
+        off = result.pop("off_nominal")
+        assert result == before
+        assert off.keys() == {"rk4", "latency", "noise", "together"}
+        assert len({each["return_mean"] for each in (result, *off.values())}) == 5
+        assert f"seed {i}," in said
+    assert said.count("nominal         rk4     latency       noise    together") == 2
+
+
+def test_off_nominal_is_for_quadrotors(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "--off-nominal: expected" in complaint(capsys, "evaluate", trained, "--off-nominal")
+
+
 def test_resume_of_a_finished_run_changes_nothing(trained: Path) -> None:
     before = {path: path.stat().st_mtime_ns for path in trained.rglob("*")}
     assert qrl("train", "pendulum", "--out", trained, "--resume") == 0

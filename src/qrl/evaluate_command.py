@@ -54,9 +54,10 @@ def evaluate(args: argparse.Namespace) -> int:
     if args.checkpoints > 1:
         for result in table:
             _print_checkpoints(result)
-    for name, (condition, _) in off.items():
-        console.print(f"  {name}: {condition.says}")
     if off:
+        console.print("\noff nominal:")
+        for name, (condition, _) in off.items():
+            console.print(f"  {name}: {condition.says}")
         for result in table:
             _print_off_nominal(result)
     if args.checkpoints == 1 and not off:
@@ -104,7 +105,7 @@ def _print_checkpoints(result: dict[str, Any]) -> None:
 
 
 def _print_off_nominal(result: dict[str, Any]) -> None:
-    console.print(f"\nseed {result['seed']}, step {result['env_steps']:,}, off nominal")
+    console.print(f"\nseed {result['seed']}, step {result['env_steps']:,}")
     nominal = {name: result[name] for name in next(iter(result["off_nominal"].values()))}
     _print_table("", {"nominal": nominal, **result["off_nominal"]})
 
