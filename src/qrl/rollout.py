@@ -98,8 +98,8 @@ def unroll(
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last
     step is `terminated` if the environment says done, and `truncated` if it reached `longest` or if the
-    environment marks its own end with info["truncated"]. The noise follows from `key`, which is this unroll's own;
-    starts from `starts`, which is the key that `begin` had.
+    environment marks its own end with info["truncated"]; it is then `early` too. The noise follows from `key`,
+    which is this unroll's own; starts from `starts`, which is the key that `begin` had.
     """
     noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), (unroll_steps, env.action_size)))
 
@@ -122,6 +122,7 @@ def unroll(
             next_observation=state.obs,
             terminated=terminated.astype(jnp.float32),
             truncated=(ended & ~terminated).astype(jnp.float32),
+            early=(done & own_truncation).astype(jnp.float32),
         )
         early = lanes.early + (done & (steps < longest))
         return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition
