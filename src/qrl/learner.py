@@ -164,7 +164,10 @@ class Learner:
         value = _apply(self.critic, params.critic, observation).reshape(samples)
         next_value = _next_values(functools.partial(value_of, jax.lax.stop_gradient(params.critic)), value, batch)
         reward = hyper["reward_scale"] * batch.reward
-        next_value = jnp.where(batch.early > 0, _bounded(next_value, reward, hyper["gamma"]), next_value)
+        # Beyond an environment's own bounds no transition begins, and so V is never fitted there: bootstrapped from, it
+        # drew policies out and grew without end. In its place the last reward, for ever.
+        for_ever = reward / jnp.maximum(1.0 - hyper["gamma"], MIN_DISCOUNTING)
+        next_value = jnp.where(batch.early > 0, for_ever, next_value)
         mean = _apply(self.policy, params.policy, observation)
         log_pi = log_density(flat(batch.action), mean, self.sigma(state)).reshape(samples)
         log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
@@ -234,16 +237,6 @@ def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, 
 
     within = jnp.any((batch.terminated + batch.truncated)[:, :-1] > 0)
     return jax.lax.cond(within, lambda: critic(batch.next_observation), shifted)
-
-
-def _bounded(value: chex.Array, reward: chex.Array, gamma: chex.Array) -> chex.Array:
-    """`value` [...] beyond an environment's own bounds, kept between nothing more and the last reward for ever.
-
-    No transition begins there, so V is never fitted: bootstrapped from as it is, it drew policies out, and grew
-    without end.
-    """
-    for_ever = reward / jnp.maximum(1.0 - gamma, MIN_DISCOUNTING)
-    return jnp.clip(value, jnp.minimum(for_ever, 0.0), jnp.maximum(for_ever, 0.0))
 
 
 def _apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:
