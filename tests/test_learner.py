@@ -21,18 +21,24 @@ def config(**changes: object) -> Config:
     return Config.model_validate(runs.preset("default") | {"normalise_observations": False} | changes, strict=False)
 
 
-def batch(seed: int = 0) -> Transition:
+def batch(seed: int = 0, ends_within: bool = True) -> Transition:
+    """Trajectories: what follows a step is what precedes the next one, but at an end."""
     rng = np.random.default_rng(seed)
-    ended = rng.random((B, T)) < 0.3
-    terminated = ended & (rng.random((B, T)) < 0.5)
+    ended = rng.random((B, T)) < 0.4
+    if not ends_within:
+        ended = np.arange(T) == np.where(np.arange(B) > 0, T - 1, T)[:, None]
+    terminated = ended & (rng.random((B, T)) < 0.4)
+    truncated = ended & ~terminated
+    observation = rng.normal(size=(B, T + 1, F))
     values = Transition(
-        observation=rng.normal(size=(B, T, F)),
+        observation=observation[:, :-1],
         action=rng.normal(size=(B, T, A)),
         log_mu=rng.normal(size=(B, T)) - 2.0,
         reward=rng.normal(size=(B, T)),
-        next_observation=rng.normal(size=(B, T, F)),
+        next_observation=np.where(ended[..., None], rng.normal(size=(B, T, F)), observation[:, 1:]),
         terminated=terminated,
-        truncated=ended & ~terminated,
+        truncated=truncated,
+        early=truncated & (np.cumsum(truncated) % 2 == 0).reshape(B, T),
     )
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
 
@@ -65,7 +71,9 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
         carried = 0.0
         for i in reversed(range(T)):
             carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
-            bootstrap = 0.0 if d.terminated[b, i] else v_next[b, i]
+            for_ever = c.reward_scale * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
+            after = for_ever if d.early[b, i] else v_next[b, i]
+            bootstrap = 0.0 if d.terminated[b, i] else after
             a_trace[b, i] = c.reward_scale * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
             carried = (min(1.0, ratio[b, i]) if off_policy else 1.0) * a_trace[b, i]
             v_trace[b, i] = v[b, i] + carried
@@ -86,11 +94,12 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
     ],
     ids=["paper", "scaled", "condition 3, constant margin", "condition 1", "condition 2: PPO with GAE"],
 )
-def test_losses_are_the_papers(changes: dict) -> None:
+@pytest.mark.parametrize("ends_within", [True, False], ids=["ends within", "ends at the end"])
+def test_losses_are_the_papers(changes: dict, ends_within: bool) -> None:
     """L_policy and L_value of Sec. 4 and Algorithm 1, against a literal loop, for each condition."""
-    learner = Learner(config(**changes), F, A)
-    expected = literal_losses(learner, batch(), off_policy=learner.config.advantage == "pi")
-    np.testing.assert_allclose(losses(learner, batch()), expected, rtol=2e-4)
+    learner, data = Learner(config(**changes), F, A), batch(ends_within=ends_within)
+    expected = literal_losses(learner, data, off_policy=learner.config.advantage == "pi")
+    np.testing.assert_allclose(losses(learner, data), expected, rtol=2e-4)
 
 
 def test_update_ascends_both_losses() -> None:
@@ -131,6 +140,7 @@ def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[ja
     after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
     log_pi = log_density(data.action, learner.policy.apply(state.params.policy, data.observation), c.sigma)
     rho = jnp.exp(log_pi - data.log_mu)
+    after = jnp.where(data.early > 0, c.reward_scale * data.reward / (1.0 - c.gamma), after)
     return jax.vmap(lambda *x: vtrace(*x, gamma=c.gamma, lam=c.lam))(
         c.reward_scale * data.reward, value, after, data.terminated, data.truncated, rho
     )

@@ -157,6 +157,7 @@ def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
             np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-5, atol=1e-5)
             assert (steps.terminated[i, t], steps.truncated[i, t]) == (terminated, truncated)
+            assert steps.early[i, t] == (bool(state.done) and truncated)
             if (terminated or truncated) and t + 1 < UNROLLS * T:
                 seen += [terminated, bool(state.done) and truncated, not bool(state.done)]
                 state, age = flight.env.at(steps.observation[i, t + 1]), 0

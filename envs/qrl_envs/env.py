@@ -16,8 +16,9 @@ import chex
 import jax.numpy as jnp
 from brax.envs.base import Env, State
 
-from qrl_envs import measures, pendulum, quadrotor, rewards
+from qrl_envs import measures, pendulum, quadrotor, rewards, symmetry
 from qrl_envs import task as tasks
+from qrl_envs.symmetry import Symmetry
 from qrl_envs.task import PendulumTask, QuadrotorTask, Task
 
 
@@ -101,6 +102,10 @@ class TaskEnv(Env):
             info={**state.info, "truncated": done},
         )
 
+    def symmetry(self, u: chex.Array) -> Symmetry:
+        """A random symmetry of the task, drawn with u [2], uniform in [0, 1)."""
+        return Symmetry(jnp.eye(self._sizes[0]), jnp.eye(self._sizes[1]))
+
     def _begin(self, params: Params, rng: chex.PRNGKey) -> State:
         x = self._draw(params, rng)
         zero = jnp.float32(0.0)
@@ -158,6 +163,10 @@ class QuadrotorEnv(TaskEnv):
         calm = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
         return ~(near & calm)  # so that a NaN ends the episode too
 
+    def symmetry(self, u: chex.Array) -> Symmetry:
+        circling = self.task.reward.form == "circle"
+        return (symmetry.circle if circling else symmetry.hover)(self.params.physics, u)
+
     def evaluation(self) -> Evaluation:
         spec, dt_s = self.task.evaluation, self.task.control_period_s
         judged = {"start": quadrotor.start(spec.start), "reward": rewards.from_spec(spec.reward)}
@@ -193,6 +202,9 @@ class PendulumEnv(TaskEnv):
 
     def _observe(self, x: pendulum.Pendulum) -> chex.Array:
         return pendulum.observe(x)
+
+    def symmetry(self, u: chex.Array) -> Symmetry:
+        return symmetry.pendulum(u)
 
     def evaluation(self) -> Evaluation:
         spec, dt_s = self.task.evaluation, self.task.control_period_s

@@ -50,6 +50,10 @@ class Config(BaseModel):
         " number that does; null: 8, or as many as lanes and minibatch_lanes allow"
     )
 
+    symmetries: Static[bool] = Field(
+        description="turn each trajectory of a minibatch by a random symmetry of the task, where it has some"
+    )
+
     policy_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the policy")
     critic_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the critic")
     activation: Static[Literal["relu", "tanh"]] = Field(description="activation of both networks")

@@ -1,6 +1,8 @@
 """One minibatch update: V-trace or GAE, the perceptron objective, the value loss, Adam (Algorithm 1)."""
 
 import copy
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import chex
@@ -17,6 +19,7 @@ from qrl.objective import perceptron
 from qrl.types import Networks, Transition
 from qrl.vtrace import vtrace
 
+MIN_DISCOUNTING = 1e-3  # of 1 − gamma, where a reward goes on for ever
 MAX_NORMALISED = 10.0  # standard deviations at which a standardised observation is clipped
 
 
@@ -153,10 +156,18 @@ class Learner:
         def flat(x: chex.Array) -> chex.Array:
             return x.reshape(-1, x.shape[-1])  # one large product instead of a batched small one
 
+        def value_of(critic: chex.ArrayTree, observation: chex.Array) -> chex.Array:
+            value = _apply(self.critic, critic, self.scale(state, flat(observation)))
+            return value.reshape(observation.shape[:-1])
+
         observation = self.scale(state, flat(batch.observation))
-        next_observation = self.scale(state, flat(batch.next_observation))
         value = _apply(self.critic, params.critic, observation).reshape(samples)
-        next_value = jax.lax.stop_gradient(_apply(self.critic, params.critic, next_observation)).reshape(samples)
+        next_value = _next_values(functools.partial(value_of, jax.lax.stop_gradient(params.critic)), value, batch)
+        reward = hyper["reward_scale"] * batch.reward
+        # Beyond an environment's own bounds no transition begins, and so V is never fitted there: bootstrapped from, it
+        # drew policies out and grew without end. In its place the last reward, for ever.
+        for_ever = reward / jnp.maximum(1.0 - hyper["gamma"], MIN_DISCOUNTING)
+        next_value = jnp.where(batch.early > 0, for_ever, next_value)
         mean = _apply(self.policy, params.policy, observation)
         log_pi = log_density(flat(batch.action), mean, self.sigma(state)).reshape(samples)
         log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
@@ -170,7 +181,7 @@ class Learner:
                 *trajectory, gamma=hyper["gamma"], lam=hyper["lam"], rho_bar=rho_bar, c_bar=c_bar
             )
         )(
-            hyper["reward_scale"] * batch.reward,
+            reward,
             jax.lax.stop_gradient(value),
             next_value,
             batch.terminated,
@@ -212,6 +223,20 @@ class Learner:
         weight = 1.0 / jnp.maximum(self._averaging(state), 1)
         average = jax.tree.map(lambda a, p: a + weight * (p - a), state.average, state.params.policy)
         return state._replace(average=average)
+
+
+def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, batch: Transition) -> chex.Array:
+    """V of what follows each step of trajectories, [B, T], where `value` is V of what precedes it.
+
+    What follows is what precedes the next step, but at ends: V is computed twice only where one lies within.
+    """
+
+    def shifted() -> chex.Array:
+        last = critic(batch.next_observation[:, -1:])
+        return jnp.concatenate([jax.lax.stop_gradient(value)[:, 1:], last], axis=1)
+
+    within = jnp.any((batch.terminated + batch.truncated)[:, :-1] > 0)
+    return jax.lax.cond(within, lambda: critic(batch.next_observation), shifted)
 
 
 def _apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:

@@ -1,6 +1,7 @@
 """A run from start to end on the host: compile, advance, report, record, save; stop and go on."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -35,9 +36,12 @@ class GoingOn:
 
 @dataclass(frozen=True)
 class Compiling:
-    """About to compile this."""
+    """About to compile."""
 
-    what: str
+
+@dataclass(frozen=True)
+class Compiled:
+    """Compiled, and all else is ready to train."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +69,7 @@ class Finished:
     rows: list[list[Row]]  # of each seed
 
 
-Event = GoingOn | Compiling | Progress | Reported | Finished
+Event = GoingOn | Compiling | Compiled | Progress | Reported | Finished
 
 
 class Member:
@@ -103,29 +107,31 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
     folders = runs.members(out, run) if peers.first() else []
     configs = [run.member(i) for i in range(run.seeds)]
     begin, clock, rows = 0, Clock(), [[] for _ in folders]
+    like = restore.shapes(trainer, points)
     states: Any = None
-    if resume:
-        like = restore.shapes(trainer, points)
-        found = restore.latest(folders, configs, like) if folders else restore.Restored(0, None, [], [])
-        begin = int(peers.firsts(np.int32(found.env_steps)))
-        if found.records:
-            rows = [list(record.rows) for record in found.records]
-            clock = Clock(found.records[0].train_seconds, found.records[0].report_seconds)
-        if begin:
-            empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
-            states = trainer.place(peers.firsts(found.states if folders else empty))
-            clock = Clock(*map(float, peers.firsts(np.array(clock))))  # the same on all: they have to save together
-        yield GoingOn(begin, found.notes)
-    if not begin:
-        yield Compiling("first state")
-        states = trainer.init(seeds(run.seed, run.seeds), points)
     members: list[Member] = []
+    # Side by side: each takes XLA seconds, and has little use for a second core.
+    with ThreadPoolExecutor() as aside:
+        yield Compiling()
+        advance = aside.submit(compile_advance, trainer, trainer.laid_out(like), points)
+        fly = aside.submit(compile_fly, trainer, trainer.laid_out(like), points)
+        if resume:
+            found = restore.latest(folders, configs, like) if folders else restore.Restored(0, None, [], [])
+            begin = int(peers.firsts(np.int32(found.env_steps)))
+            if found.records:
+                rows = [list(record.rows) for record in found.records]
+                clock = Clock(found.records[0].train_seconds, found.records[0].report_seconds)
+            if begin:
+                empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
+                states = trainer.place(peers.firsts(found.states if folders else empty))
+                clock = Clock(*map(float, peers.firsts(np.array(clock))))  # the same on all: they have to save together
+            yield GoingOn(begin, found.notes)
+        if not begin:
+            states = trainer.init(seeds(run.seed, run.seeds), points)
+        programs = Programs(advance.result(), fly.result(), trainer.on_host)
     try:
         members = [Member(folder, configs[i], begin, rows[i]) for i, folder in enumerate(folders)]
-        yield Compiling("training")
-        advance = compile_advance(trainer, states, points)
-        yield Compiling("evaluation")
-        programs = Programs(advance, compile_fly(trainer, states, points), trainer.on_host)
+        yield Compiled()
         saver = _Saver(trainer, run, members, clock)
         for lap in laps(states, points, programs, run.learner, clock, stopped, peers.everyones):
             states, begin = lap.states, lap.env_steps

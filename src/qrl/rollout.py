@@ -4,6 +4,7 @@ Brax's AutoResetWrapper restarts a lane from that lane's own first state and los
 here every episode gets a new draw, and the observation before reset is recorded.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -14,6 +15,8 @@ from brax.envs.base import Env, State
 
 from qrl.networks import log_density
 from qrl.types import Transition
+
+BLOCK_LANES = 512  # stepped at a time on a CPU: with more, what passes between the steps leaves its cache
 
 
 class Lanes(NamedTuple):
@@ -98,9 +101,27 @@ def unroll(
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last
     step is `terminated` if the environment says done, and `truncated` if it reached `longest` or if the
-    environment marks its own end with info["truncated"]. The noise follows from `key`, which is this unroll's own;
-    starts from `starts`, which is the key that `begin` had.
+    environment marks its own end with info["truncated"]; it is then `early` too. The noise follows from `key`,
+    which is this unroll's own; starts from `starts`, which is the key that `begin` had.
     """
+    count = lanes.number.shape[0]
+    one = functools.partial(_unroll, env, mean, sigma, key, starts, unroll_steps, longest)
+    if jax.default_backend() != "cpu" or count <= BLOCK_LANES or count % BLOCK_LANES:
+        return one(lanes)
+    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK_LANES, *x.shape[1:]), lanes)
+    return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), jax.lax.map(one, blocks))
+
+
+def _unroll(
+    env: Env,
+    mean: Callable[[chex.Array], chex.Array],
+    sigma: chex.Array,
+    key: chex.PRNGKey,
+    starts: chex.PRNGKey,
+    unroll_steps: int,
+    longest: int,
+    lanes: Lanes,
+) -> tuple[Lanes, Transition]:
     noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), (unroll_steps, env.action_size)))
 
     def step(lanes: Lanes, noise: chex.Array) -> tuple[Lanes, Transition]:
@@ -122,6 +143,7 @@ def unroll(
             next_observation=state.obs,
             terminated=terminated.astype(jnp.float32),
             truncated=(ended & ~terminated).astype(jnp.float32),
+            early=(done & own_truncation).astype(jnp.float32),
         )
         early = lanes.early + (done & (steps < longest))
         return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition

@@ -6,6 +6,7 @@ other inside the program (`lax.map`), which is faster there than batching small 
 Over several devices (`spread`) members part first, and then each member's lanes, with their part of ring and minibatch.
 """
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -127,6 +128,17 @@ class Trainer:
 
         return jax.tree.map(put, LAYOUT, states, is_leaf=lambda x: isinstance(x, P))
 
+    def laid_out(self, states: TrainState) -> TrainState:
+        """Shapes and types of states, with where `place` would put them."""
+        if not (mesh := self.mesh):
+            return states
+
+        def lay(spec: P, part: Any) -> Any:
+            where = NamedSharding(mesh, spec)
+            return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where), part)
+
+        return jax.tree.map(lay, LAYOUT, states, is_leaf=lambda x: isinstance(x, P))
+
     def on_host(self, tree: Any) -> Any:
         """Values of the programs in NumPy, wherever their parts are."""
         return jax.tree.map(np.asarray, self._everywhere(tree) if self.mesh else tree)
@@ -216,23 +228,45 @@ class Trainer:
 
     def _advance(self, state: TrainState, point: Point, until: chex.Array) -> TrainState:
         """Go on until `until` unrolls have been made; where it pauses on the way changes nothing."""
-        learner, _ = self._under(point)
-        return jax.lax.fori_loop(state.unrolls, until, lambda _, state: self._unroll_and_learn(learner, state), state)
+        learner, env = self._under(point)
+        step = functools.partial(self._unroll_and_learn, learner, env)
+        return jax.lax.fori_loop(state.unrolls, until, lambda _, state: step(state), state)
 
-    def _unroll_and_learn(self, learner: Learner, state: TrainState) -> TrainState:
+    def _turns(self, keys: chex.PRNGKey, index: chex.Array) -> chex.Array:
+        """What draws a symmetry for each trajectory at `index` [minibatches, S·each]; [minibatches, S·each, 2]."""
+        minibatches, width = index.shape
+        shape = (minibatches, width // len(keys), 2)
+        drawn = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, 1), shape))(keys)
+        return jnp.swapaxes(drawn, 0, 1).reshape(minibatches, width, 2)
+
+    def _turned(self, env: Env, batch: Transition, turns: chex.Array) -> Transition:
+        """Trajectories [B, T, ...], each under the symmetry that `turns` [B, 2] draws."""
+        symmetry = getattr(env, "symmetry", None)
+        if not (self.config.symmetries and symmetry):
+            return batch
+        under = jax.vmap(symmetry)(turns)
+        return batch._replace(
+            observation=batch.observation @ under.observation.swapaxes(1, 2),
+            next_observation=batch.next_observation @ under.observation.swapaxes(1, 2),
+            action=batch.action @ under.action.swapaxes(1, 2),
+        )
+
+    def _unroll_and_learn(self, learner: Learner, env: Env, state: TrainState) -> TrainState:
         collect_key, learn_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
         lanes, transitions = self._collect(learner, state.learner, state.lanes, collect_key, state.starts)
         observed = learner.observe(state.learner, transitions.observation)
         ring = buffer.add(state.ring, transitions)
 
-        def update(now: LearnerState, index: chex.Array) -> tuple[LearnerState, Terms]:
-            return learner.update(now, buffer.gather(ring, index))
+        def update(now: LearnerState, drawn: tuple[chex.Array, chex.Array]) -> tuple[LearnerState, Terms]:
+            index, turn = drawn
+            return learner.update(now, self._turned(env, buffer.gather(ring, index), turn))
 
         def learn(now: LearnerState) -> tuple[LearnerState, Terms]:
             shards = self.config.logical_shards
             keys = jax.vmap(lambda shard: jax.random.fold_in(learn_key, shard))(self._share(shards))
             each = self.config.minibatch_lanes // shards
-            return jax.lax.scan(update, now, buffer.draw(ring, keys, self.config.updates_per_unroll, each))
+            index = buffer.draw(ring, keys, self.config.updates_per_unroll, each)
+            return jax.lax.scan(update, now, (index, self._turns(keys, index)))
 
         def wait(now: LearnerState) -> tuple[LearnerState, Terms]:
             zeros = jnp.zeros(self.config.updates_per_unroll)

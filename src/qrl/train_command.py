@@ -134,14 +134,11 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> loop.Finished | 
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("", total=config.learner.unrolls * config.learner.unroll_size, note="")
-        compiling = ""
         for event in events:
-            if compiling and not isinstance(event, loop.Compiling):
-                console.print(_HEADER)
-                compiling = ""
             if isinstance(event, loop.Compiling):
-                compiling = event.what
-                console.print(f"compiling {event.what} ({time.perf_counter() - started:.1f} s)")
+                console.print("compiling")
+            elif isinstance(event, loop.Compiled):
+                console.print(f"compiled in {time.perf_counter() - started:.1f} s\n{_HEADER}")
             elif isinstance(event, loop.GoingOn):
                 for note in event.notes:
                     complain(f"warning: {note}")

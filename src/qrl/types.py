@@ -12,9 +12,10 @@ class Transition(NamedTuple):
     action: chex.Array  # [..., A] as drawn from mu, not clipped
     log_mu: chex.Array  # [...] log-density of `action` under the policy that drew it
     reward: chex.Array  # [...]
-    next_observation: chex.Array  # [..., F] after the step, before any reset
+    next_observation: chex.Array  # [..., F] after the step, before any reset: the next `observation` but at an end
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
+    early: chex.Array  # [...] float 0 or 1: truncated by the environment itself, out of its bounds
 
 
 class Networks(NamedTuple):
