@@ -28,6 +28,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "rewards": 1,
         "measures": 1,
         "ports": 1,
+        "symmetry": 1,
         "env": 2,
         "conditions": 2,
         "__init__": 2,
