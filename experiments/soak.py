@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from qrl import loop, request, runs
+from qrl import laps, loop, request, runs
 
 REPORT_STEPS = 1_000_000
 SETTLED = 0.25  # of the reports: what comes after is held against their end
@@ -55,7 +55,7 @@ def main() -> int:
                 rows.append(report | {"seconds": seconds, "memory_MB": memory_MB(), "compilations": compiled[0]})
                 print(rows[-1], flush=True)
                 runs.replace_text(args.out / "soak.csv", runs.csv_text(rows))
-    except loop.NotFinite as error:
+    except laps.NotFinite as error:
         not_finite = str(error)
         print(not_finite, file=sys.stderr)
     if len(rows) < 4:

@@ -67,6 +67,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "grid": 4,
         "results": 4,
         "sweep_command": 4,
+        "export_command": 4,
         "train_command": 4,
         "evaluate_command": 4,
         "deploy": 4,

@@ -172,7 +172,7 @@ class Poisoned(Env):
 def test_nan_stops_the_run_and_keeps_the_last_good_checkpoint(tmp_path: Path) -> None:
     """The message names term, update and checkpoint; the checkpoint holds only finite numbers."""
     env = Poisoned(bad=100.0)
-    with pytest.raises(loop.NotFinite, match=r"reward is not finite in update 18; the checkpoint at step 400 is kept"):
+    with pytest.raises(laps.NotFinite, match=r"reward is not finite in update 18; the checkpoint at step 400 is kept"):
         train(tmp_path, run_config(), env)
     assert all(np.isfinite(leaf).all() for leaf in last_state(tmp_path, run_config(), env))
     assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [200, 400]
@@ -181,7 +181,7 @@ def test_nan_stops_the_run_and_keeps_the_last_good_checkpoint(tmp_path: Path) ->
 def test_fault_in_the_learner_is_named(tmp_path: Path, pendulum: Env) -> None:
     """A step size that blows the networks up is found in the learner's own terms, not in the world."""
     with pytest.raises(
-        loop.NotFinite, match=r"(log_rho|value|a_trace|_loss|_gradient|reward|observation) is not finite"
+        laps.NotFinite, match=r"(log_rho|value|a_trace|_loss|_gradient|reward|observation) is not finite"
     ):
         train(tmp_path, run_config(learning_rate=1e30, learning_rate_end=1e30), pendulum)
 

@@ -20,6 +20,10 @@ REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # how long the device works between two signs of life
 
 
+class NotFinite(RuntimeError):
+    """A number in training is not finite; the message says which, where and what was kept."""
+
+
 class Clock(NamedTuple):
     """Seconds of training, without compilation and evaluation."""
 

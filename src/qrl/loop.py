@@ -13,17 +13,13 @@ from brax.envs.base import Env
 from qrl import checkpoint, peers, restore, runs
 from qrl.checkpoint import Checkpoint
 from qrl.evaluate import Flights
-from qrl.laps import Clock, Lap, Programs, compile_advance, compile_fly, laps, report_starts, seeds
+from qrl.laps import Clock, Lap, NotFinite, Programs, compile_advance, compile_fly, laps, report_starts, seeds
 from qrl.runs import Row, RunConfig
 from qrl.seal import Record
 from qrl.tensorboard import EventLog
 from qrl.train import Trainer, point, spread, stack
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
-
-
-class NotFinite(RuntimeError):
-    """A number in training is not finite; the message says which, where and what was kept."""
 
 
 @dataclass(frozen=True)

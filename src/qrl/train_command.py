@@ -13,11 +13,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn
 
-from qrl import loop, peers, plots, processes, request, runs
+from qrl import loop, peers, processes, request, runs
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.runs import Row, RunConfig
 from qrl.terminal import clock, console, stop_requested
-from qrl_envs import picture
 from qrl_envs.specfile import BadInput
 
 PICTURE_FLIGHTS = 5
@@ -178,6 +177,10 @@ def _spread(rows: list[Row], name: str, form: str) -> str:
 
 def _finish(out: Path, config: RunConfig, finished: loop.Finished, seconds: float) -> None:
     """Pictures, then summary.json of each seed, then that of the whole."""
+    # Only now: a second of matplotlib.
+    from qrl import plots
+    from qrl_envs import picture
+
     folders = runs.members(out, config)
     history = finished.rows
     for i, folder in enumerate(folders):
