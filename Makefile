@@ -25,7 +25,7 @@ define HELP
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
   make bench                         timings beside peers, each in an environment of its own: downloads them
-       ARGS="--only pendulum"          groups or contestants (ARGS=--list names them); --seeds 5; the same command goes on
+       ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright

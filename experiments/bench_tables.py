@@ -121,12 +121,16 @@ def _of(lines: list[dict[str, float]], name: str) -> str:
 
 
 def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
-    """Of the group `speed`: figure -> contestant -> value by seed."""
+    """Of the group `speed`: figure -> contestant -> value by seed. How a contestant ran ("qrl, two devices") is the
+    figure's part, so that like is held against like.
+    """
     found: dict[str, dict[str, dict[int, float]]] = {}
     for run in runs:
+        who, *how = run["contestant"].split(", ")
         for line in run["lines"]:
             value = line.get("per_second", line.get("seconds"))
-            found.setdefault(line["figure"], {}).setdefault(run["contestant"], {})[run["seed"]] = float(value)
+            figure = ", ".join([line["figure"], *how])
+            found.setdefault(figure, {}).setdefault(who, {})[run["seed"]] = float(value)
     return found
 
 

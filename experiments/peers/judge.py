@@ -81,10 +81,10 @@ class Judge:
         """Count what JAX compiles from here on."""
         import jax  # in the contestant's environment, if it has one
 
-        def heard(event: str, seconds: float, **_: object) -> None:
+        def heard(event: str, duration_secs: float, **_: str | int) -> None:
             if event.startswith("/jax/core/compile/"):
                 now = time.time()
-                self._spans.append((now - seconds, now))
+                self._spans.append((now - duration_secs, now))
 
         jax.monitoring.register_event_duration_secs_listener(heard)
         return self

@@ -34,7 +34,7 @@ def main() -> None:
     judge = pendulum_judge()
 
     def environment(**options: Any) -> gymnasium.Env:
-        env = RescaleAction(gymnasium.make("Pendulum-v1", **options), -1, 1)
+        env = RescaleAction(gymnasium.make("Pendulum-v1", **options), np.float32(-1.0), np.float32(1.0))
         env.reset(seed=args.seed)
         return env
 
