@@ -23,14 +23,18 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Act = Callable[[Array], Any]  # observations [n, 3] -> actions [n, 1] in [−1, 1]: torque over the greatest torque
 
-STARTS, STARTS_SEED, STEPS = 1000, 1_000_003, 200
+LATTICE, STEPS = (40, 25), 200  # starts, of angle and rate
 GRAVITY, MASS, LENGTH, MAX_TORQUE, MAX_RATE, DT = 10.0, 1.0, 1.0, 2.0, 8.0, 0.05
 
 
-def pendulum_starts(count: int = STARTS) -> tuple[Array, Array]:
-    """The fixed starts: θ uniform in ±π, rate in ±1; [n] and [n]."""
-    u = np.random.default_rng(STARTS_SEED).uniform(-1.0, 1.0, (2, count))
-    return np.pi * u[0], u[1]
+def pendulum_starts() -> tuple[Array, Array]:
+    """The 1,000 starts: the middles of a lattice's cells over θ in ±π and rates in ±1; [n] and [n].
+
+    Drawn at random, the mean return over as many differs by 2.4 (one deviation) from draw to draw, whatever the policy;
+    over these it is within 0.3 of what it is over all starts.
+    """
+    angle, rate = (2.0 * (np.arange(count) + 0.5) / count - 1.0 for count in LATTICE)
+    return np.repeat(np.pi * angle, LATTICE[1]), np.tile(rate, LATTICE[0])
 
 
 def pendulum_step(theta: Array, rate: Array, action: Array) -> tuple[Array, Array, Array]:
