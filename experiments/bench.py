@@ -24,6 +24,7 @@ from bench_contestants import CONTESTANTS, Contestant, chosen, key
 from bench_install import NotInstalled, python_of
 from bench_plot import plot
 from bench_tables import Run, page
+from qrl import runs as records
 
 ROOT = Path(__file__).resolve().parents[1]
 PEERS = ROOT / "experiments" / "peers"
@@ -64,19 +65,29 @@ def main(argv: list[str] | None = None) -> int:
         contestants = chosen(args.only)
     except ValueError as error:
         parser.error(str(error))
+    try:
+        bench(contestants, args)
+    except OSError as error:
+        print(f"bench: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def bench(contestants: list[Contestant], args: argparse.Namespace) -> None:
+    """All runs that are not there yet, and the three files anew after each seed."""
     folder = args.out / "runs"
     folder.mkdir(parents=True, exist_ok=True)
     pythons, absent = installed(contestants, PEERS, args.environments)
     for seed in range(args.seeds):
         for contestant in contestants:
             path = folder / f"{key(contestant).replace('/', '-')}-{seed}.json"
-            if contestant.environment in pythons and (args.fresh or not finished(path)):
+            if contestant.environment in pythons and (args.fresh or not made(path, contestant, args.budget_seconds)):
                 run = fly(contestant, pythons[contestant.environment], seed, args.budget_seconds, args.out / "cache")
                 say(run)
                 replace(path, json.dumps(run, indent=1) + "\n")
-    runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-    tell(args.out, in_order(runs), absent)
-    return 0
+        runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
+        tell(args.out, in_order(runs), absent)
+    print(f"{args.out}/bench.json, bench.md, bench.png")
 
 
 def installed(
@@ -95,9 +106,17 @@ def installed(
     return pythons, absent
 
 
-def finished(path: Path) -> bool:
-    """Whether there is such a run, and it did not fail."""
-    return path.exists() and json.loads(path.read_text())["outcome"] in FINISHED
+def made(path: Path, contestant: Contestant, budget_seconds: float) -> bool:
+    """Whether this very run is there, and did not fail. Which commit's it is, it says, and so does the page."""
+    if not path.exists():
+        return False
+    run = json.loads(path.read_text())
+    same = run["command"] == command(contestant) and run["budget_seconds"] == budget_seconds
+    return same and run["outcome"] in FINISHED
+
+
+def command(contestant: Contestant) -> list[str]:
+    return [contestant.script, *contestant.words]
 
 
 def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, cache: Path) -> Run:
@@ -117,20 +136,22 @@ def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, 
         env["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={contestant.devices}"
     if contestant.group == "speed":
         env["JAX_COMPILATION_CACHE_DIR"] = str(cache.absolute())
-    command = [str(python), str(PEERS / contestant.script), *contestant.words, "--seed", str(seed)]
-    out, err, outcome = in_time(command, env, budget_seconds + GRACE_SECONDS)
+    load = round(os.getloadavg()[0], 2)  # how quiet the machine was
+    script = [str(python), str(PEERS / contestant.script), *contestant.words, "--seed", str(seed)]
+    out, err, outcome = in_time(script, env, budget_seconds + GRACE_SECONDS)
     lines = [json.loads(line.removeprefix(MARK)) for line in out.splitlines() if line.startswith(MARK)]
     said = (err.strip().splitlines() or [""])[-1][:300] if outcome.startswith("exit") else ""
     who = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
-    return {**who, "outcome": outcome, "said": said, "command": [contestant.script, *contestant.words], "lines": lines}
+    how = {"command": command(contestant), "budget_seconds": budget_seconds, "commit": records.commit(), "load": load}
+    return {**who, **how, "outcome": outcome, "said": said, "lines": lines}
 
 
-def in_time(command: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:
+def in_time(words: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:
     """(standard output, standard error, how it ended) of a command in a folder of its own, where some leave things."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with (
         tempfile.TemporaryDirectory() as folder,
-        subprocess.Popen(command, env=env, cwd=folder, start_new_session=True, **pipes) as process,
+        subprocess.Popen(words, env=env, cwd=folder, start_new_session=True, **pipes) as process,
     ):
         try:
             out, err = process.communicate(timeout=seconds)
@@ -161,7 +182,6 @@ def tell(out: Path, runs: list[Run], absent: dict[str, str]) -> None:
     replace(out / "bench.json", json.dumps({"machine": here, "absent": absent, "runs": runs}, indent=1) + "\n")
     replace(out / "bench.md", page(runs, absent, here))
     plot(out / "bench.png", runs)
-    print(f"{out}/bench.json, bench.md, bench.png")
 
 
 def machine() -> dict[str, Any]:
@@ -172,10 +192,8 @@ def machine() -> dict[str, Any]:
     except (OSError, StopIteration):
         model = platform.processor() or platform.machine()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    from qrl import runs  # imports nothing heavy
-
     kept = ("qrl", "commit", "jax", "brax")
-    versions = {name: value for name, value in runs.versions().items() if name in kept}
+    versions = {name: value for name, value in records.versions().items() if name in kept}
     return {"CPU": model, "cores": cores, "Python": platform.python_version(), **versions}
 
 
@@ -186,7 +204,12 @@ def replace(path: Path, text: str) -> None:
     temporary.replace(path)
 
 
+def stop(*_: object) -> NoReturn:
+    raise KeyboardInterrupt
+
+
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, stop)  # or the run at work would go on alone
     try:
         sys.exit(main())
     except KeyboardInterrupt:

@@ -148,6 +148,8 @@ def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> st
     """bench.md."""
     said = "; ".join(f"{name} {value}" for name, value in machine.items())
     parts = ["# qrl beside its peers", f"{said}."]
+    if len(commits := sorted({run["commit"] for run in runs if "commit" in run})) > 1:
+        parts.append(f"**Runs of several commits**: {', '.join(commits)}. `--fresh` makes all anew.")
     parts.append(
         "Median [least … greatest] over seeds. A ratio is formed of runs made one after the other, seed by seed, and"
         " then spread likewise. *not*: most runs did not solve it within their budget."

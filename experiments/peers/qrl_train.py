@@ -5,6 +5,7 @@ schedule, so that a policy is best at its end. It is checked `--checks` times on
 """
 
 import argparse
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -29,11 +30,11 @@ def contestant(task: str, preset: str | None, seed: int) -> tuple[Trainer, Any, 
     return Trainer(env, run.learner), stack([point(env, run.learner)]), run
 
 
-def pendulum_act(trainer: Trainer, member: Any) -> Act:
-    """The policy that ships as a function of observations in NumPy."""
+def pendulum_judged(trainer: Trainer) -> Callable[[Any], Act]:
+    """The policy that ships as a function of observations in NumPy; compiled once."""
     learner = trainer.learner
     mean = jax.jit(lambda state, o: jnp.clip(learner.mean(learner.shipped(state), o), -1.0, 1.0))
-    return lambda observation: np.asarray(mean(member, jnp.asarray(observation, jnp.float32)))
+    return lambda member: lambda observation: np.asarray(mean(member, jnp.asarray(observation, jnp.float32)))
 
 
 def main() -> None:
@@ -51,6 +52,7 @@ def main() -> None:
         return summarise(jax.tree.map(lambda x: x[0], trainer.fly(learners, points, keys)))
 
     judge: Judge = pendulum_judge() if args.task == "pendulum" else success_judge(flights)
+    judged = pendulum_judged(trainer)
     judge.hear_jax().start()
     states = trainer.init(laps.seeds(run.seed, 1), points)
     advance = laps.compile_advance(trainer, states, points)
@@ -58,8 +60,7 @@ def main() -> None:
     for until in (round(config.unrolls * (i + 1) / pieces) for i in range(pieces)):
         states = jax.block_until_ready(advance(states, points, np.int32(until)))
         learners = states.learner
-        pendulum = args.task == "pendulum"
-        policy = pendulum_act(trainer, jax.tree.map(lambda x: x[0], learners)) if pendulum else learners
+        policy = judged(jax.tree.map(lambda x: x[0], learners)) if args.task == "pendulum" else learners
         if judge.check(until * config.unroll_size, policy):
             break
 
