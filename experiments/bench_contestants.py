@@ -39,7 +39,8 @@ CONTESTANTS = (
     Contestant("qrl, two devices", "speed", "../throughput.py", ("--only", "training"), devices=2),
     Contestant("Brax", "speed", "brax_speed.py", (), "brax"),
     Contestant("Brax, two devices", "speed", "brax_speed.py", ("--only", "training"), "brax", devices=2),
-    Contestant("crazyflow", "speed", "crazyflow_physics.py", (), "crazyflow"),
+    Contestant("crazyflow", "speed", "crazyflow_physics.py", ("first_principles",), "crazyflow"),
+    Contestant("crazyflow so_rpy", "speed", "crazyflow_physics.py", ("so_rpy",), "crazyflow"),
     Contestant("qrl command", "speed", "qrl_startup.py", ("hover",)),
 )
 

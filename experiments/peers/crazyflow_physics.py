@@ -1,7 +1,7 @@
-"""crazyflow's physics alone on a CPU, in steps a second: `crazyflow_physics.py --seed N`.
+"""crazyflow's physics alone on a CPU, in steps a second: `crazyflow_physics.py first_principles|so_rpy --seed N`.
 
-Its first-principles dynamics (rotors, drag and all) told rotor speeds, symplectic Euler as ours, no controller, at
-100 Hz: the nearest to our quadrotor's step. Its step does more than ours, and both are what a user gets.
+first_principles (rotors, drag and all) is told rotor speeds and is the nearest to our quadrotor's step, of which it
+does more; so_rpy, fitted to flights, is told attitudes and thrust and is its fastest. Symplectic Euler, as ours, 100 Hz.
 """
 
 import argparse
@@ -18,18 +18,23 @@ from rates import LANES, UNROLL_STEPS, rate
 FREQUENCY_HZ = 100
 
 
-def physics(lanes: int, seed: int) -> None:
+def physics(dynamics: Dynamics, lanes: int, seed: int) -> None:
+    rotors = dynamics == Dynamics.first_principles
     sim = Sim(
         n_worlds=lanes,
-        dynamics=Dynamics.first_principles,
-        control=Control.rotor_vel,
+        dynamics=dynamics,
+        control=Control.rotor_vel if rotors else Control.attitude,
         integrator=Integrator.symplectic_euler,
         freq=FREQUENCY_HZ,
+        attitude_freq=FREQUENCY_HZ,
         device="cpu",
         rng_key=seed,
     )
     sim.reset()
-    sim.rotor_vel_control(jnp.full((lanes, 1, 4), 10_000.0))
+    if rotors:
+        sim.rotor_vel_control(jnp.full((lanes, 1, 4), 10_000.0))
+    else:
+        sim.attitude_control(jnp.zeros((lanes, 1, 4)).at[..., 3].set(0.3))
 
     def step(_: object) -> None:
         sim.step(UNROLL_STEPS)
@@ -39,9 +44,11 @@ def physics(lanes: int, seed: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
+    parser.add_argument("dynamics", choices=["first_principles", "so_rpy"])
     parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
     for lanes in LANES:
-        physics(lanes, parser.parse_args().seed)
+        physics(Dynamics(args.dynamics), lanes, args.seed)
 
 
 if __name__ == "__main__":
