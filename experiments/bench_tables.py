@@ -32,8 +32,8 @@ def spread(values: Iterable[float]) -> Spread:
 
 
 def first_at(run: Run, name: str, bar: float) -> dict[str, float] | None:
-    """A run's first check at which `name` is at least `bar`; NaN never is."""
-    return next((line for line in run["lines"] if line.get(name, math.nan) >= bar), None)
+    """A run's first check at which `name` is at least `bar`; what is no number never is."""
+    return next((line for line in run["lines"] if line.get(name) is not None and line[name] >= bar), None)
 
 
 def to_solve(run: Run, clock: str, bar: float | None = None) -> float:

@@ -4,6 +4,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +65,7 @@ def test_the_judges_starts_stand_for_the_tasks() -> None:
     """Within its ranges, evenly: a fair policy's mean return is what it is over twenty times as many."""
     theta, rate = judge.pendulum_starts()
     assert len(theta) == len(rate) == 1000
-    start = worlds.make("pendulum").task.start
+    start: Any = worlds.make("pendulum").task.start
     assert 0.97 < np.abs(theta).max() / start.angle_rad < 1.0
     assert 0.95 < np.abs(rate).max() / start.rate_rad_s < 1.0
 
@@ -120,6 +121,7 @@ def test_solved_is_the_first_check_that_reaches_the_bar() -> None:
     assert to_solve(run("peer", 0, *checks), "train_seconds", -145.0) == 4.0
     assert to_solve(run("peer", 0, *checks), "steps", -100.0) == math.inf
     assert to_solve(run("peer", 0), "steps") == math.inf
+    assert to_solve(run("peer", 0, {"steps": 10, "return_mean": None}), "steps") == math.inf
 
 
 def test_spreads_and_ratios() -> None:

@@ -11,6 +11,7 @@ total_seconds    since the process was started: interpreter, imports, compilatio
 """
 
 import json
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -142,5 +143,6 @@ def success_judge(success: Callable[[Any], dict[str, float]]) -> Judge:
 
 
 def report(line: dict[str, Any]) -> None:
-    """A line for the harness."""
-    print("BENCH " + json.dumps(line), flush=True)
+    """A line for the harness; a number that is not finite becomes null, for JSON has none."""
+    plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in line.items()}
+    print("BENCH " + json.dumps(plain), flush=True)
