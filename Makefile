@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export sweep tasks test smoke lint torture FORCE
+.PHONY: help setup train evaluate export sweep tasks bench test smoke lint torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -25,6 +25,8 @@ define HELP
   make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
+  make bench                         timings beside peers, each in an environment of its own: downloads them
+       ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright
@@ -65,6 +67,9 @@ sweep: $(STAMP)
 
 tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)
+
+bench: $(STAMP)
+	@exec $(VENV)/bin/python experiments/bench.py $(ARGS)
 
 # Two processes: on the two cores that the ten minutes are promised for. A file's tests share what they train.
 WORKERS := -n 2 --dist loadfile

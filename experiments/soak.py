@@ -38,7 +38,7 @@ def main() -> int:
     (args.out / "run").mkdir(parents=True)
     began, compiled, rows = time.perf_counter(), [0], []
 
-    def count(event: str, _: float, **__: object) -> None:
+    def count(event: str, duration_secs: float, **_: str | int) -> None:
         compiled[0] += event == "/jax/core/compile/backend_compile_duration"
 
     jax.monitoring.register_event_duration_secs_listener(count)
