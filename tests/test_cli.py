@@ -102,6 +102,7 @@ def test_run_that_exists_is_refused(trained: Path, capsys: pytest.CaptureFixture
         (["hover"], "not the same task"),
         (["pendulum", "--seed", "3"], "key 'seed' is 0, found 3"),
         (["pendulum", "--gamma", "0.5"], "key 'learner.gamma' is 0.9"),
+        (["pendulum", "--preset", "circle"], "key 'learner.steps' is"),
     ],
 )
 def test_resume_of_another_run_is_refused(
@@ -121,6 +122,7 @@ def test_resume_of_another_run_is_refused(
         (["hover", "--steps", "many"], "command line: key 'steps': expected a valid integer, found \"many\""),
         (["hover", "--steps", "-5"], "command line: key 'steps': expected greater than or equal to 1, found -5"),
         (["hover", "--gamma", "1.5"], "key 'gamma': expected less than or equal to 1, found 1.5"),
+        (["hover", "--preset", "hovr"], "--preset: no preset 'hovr' (did you mean 'hover'?)"),
         (["hover", "--seed", "x"], "--seed: invalid whole_number value: 'x'"),
         (["hover", "--form", "quotient"], "key 'form': expected 'ratio' or 'difference', found \"quotient\""),
         (["hover", "--observation-scale", "[1,2]"], "expected 18 numbers"),

@@ -31,7 +31,7 @@ LONGEST = 1000  # characters of a message
 BUDGET = 2e7  # bytes of a grid's points
 
 PENDULUM = request.task_record("pendulum")
-LEARNER = specfile.build(Config, request.preset(PENDULUM, ""), "")
+LEARNER = specfile.build(Config, request.task_preset(PENDULUM, ""), "")
 RUN = RunConfig(task=PENDULUM, learner=LEARNER, seed=3, seeds=2, versions={"jax": "1"}, devices=["cpu"])
 PART = {"task": "circle", "learner": {"gamma": 0.9, "policy_hidden": [8, 8], "observation_scale": [1] * 18}, "seed": 1}
 

@@ -70,6 +70,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     train.add_argument("--out", type=Path, help="run folder (runs/TASK)", metavar="FOLDER")
     train.add_argument("--config", type=Path, help="a config.json, whole or in part", metavar="FILE")
     train.add_argument("--resume", action="store_true", help="go on from the run folder's last checkpoint")
+    train.add_argument("--preset", help="hyperparameters by name, in place of the task's preset", metavar="NAME")
     learner = train.add_argument_group("learner", "each as in the presets; the default is the task's preset")
     for name, field in Config.model_fields.items():
         text = (field.description or "").replace("%", "%%")

@@ -119,7 +119,7 @@ def load(path: Path, budget_bytes: float) -> Grid:
     }
     refuse_clashes(file.fixed, axes, known, str(path))
     count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
-    reports = file.fixed.get("reports", request.preset(task, str(path))["reports"])
+    reports = file.fixed.get("reports", request.task_preset(task, str(path))["reports"])
     kept = (
         len(file.seeds)
         * REPORT_BYTES
@@ -203,4 +203,4 @@ def _point(
     if spec is not task.spec:
         checked = tasks.from_data(spec, f"{where}: task").model_dump(mode="json", exclude_none=True)
         task = TaskRecord(name=task.name, spec=checked)
-    return GridPoint(place, task, specfile.build(Config, request.preset(task, where) | learner, where))
+    return GridPoint(place, task, specfile.build(Config, request.task_preset(task, where) | learner, where))

@@ -119,18 +119,22 @@ def _countable(run: RunConfig, where: str) -> RunConfig:
     return run
 
 
-def preset(record: TaskRecord, where: str) -> dict[str, Any]:
-    """The learner's defaults for a task, which `where` names."""
-    name = record.spec["preset"] if record.spec else "default"
+def preset(name: str, where: str) -> dict[str, Any]:
+    """The preset of that name, which `where` names: all of the learner's values."""
     if name not in runs.presets():
-        raise BadInput(f"{where}: the task's key 'preset': no preset '{name}'{specfile.nearest(name, runs.presets())}")
+        raise BadInput(f"{where}: no preset '{name}'{specfile.nearest(name, runs.presets())}")
     return runs.preset(name)
+
+
+def task_preset(record: TaskRecord, where: str) -> dict[str, Any]:
+    """The learner's defaults for a task, which `where` names."""
+    return preset(record.spec["preset"] if record.spec else "default", f"{where}: the task's key 'preset'")
 
 
 def _learner(
     record: TaskRecord, where: str, config: Path | None, learner: dict[str, Any], flags: dict[str, Any]
 ) -> Config:
-    base = preset(record, where) | learner
+    base = task_preset(record, where) | learner
     file = f"{config}: learner" if config else f"preset of {record.name}"
     try:
         return specfile.build(Config, base | flags, "command line")

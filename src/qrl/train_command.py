@@ -99,8 +99,10 @@ def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, b
 
 
 def _flags(args: argparse.Namespace) -> dict[str, Any]:
-    """The learner's flags that were given, each read as JSON or a number where it is one, else as text."""
-    given: dict[str, Any] = {}
+    """The learner's flags that were given, each read as JSON or a number where it is one, else as text; under them a
+    preset's.
+    """
+    given: dict[str, Any] = request.preset(args.preset, "--preset") if args.preset else {}
     for name, text in vars(args).items():
         if name.startswith("learner.") and text is not None:
             given[name.removeprefix("learner.")] = _value(text)
