@@ -1,8 +1,8 @@
 """Where a training run's time goes: `profile_run.py [TASK] [--repeats 9]`, a table in Markdown.
 
 Each part of one unroll-and-learn of the task's preset is compiled alone and timed, all in turn, medians over repeats.
-"Of the floor" is the share of that time which its multiply-adds alone would take, at the rate that a 64 x 64 product has
-on this machine at the same time.
+"Of the floor" is the share of that time which its multiply-adds alone would take, at the rate of a 64 x 64 product on
+this machine at the same time.
 """
 
 import argparse
