@@ -1,5 +1,6 @@
 """Symmetries of the tasks: the turned world goes the turned way, for the same reward."""
 
+import json
 from typing import Any
 
 import jax
@@ -8,6 +9,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from qrl import runs
+from qrl.config import Config
+from qrl.train import Trainer
+from qrl.types import Transition
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from qrl_envs import task as tasks
@@ -118,3 +123,25 @@ def test_the_pendulum_swings_either_way() -> None:
         np.testing.assert_allclose(env._observe(turned), turn.observation @ env._observe(there), atol=1e-5)
         np.testing.assert_allclose(same, reward, rtol=1e-5)
     assert found == {1.0, -1.0}
+
+
+def test_a_minibatch_is_turned_trajectory_by_trajectory() -> None:
+    """Observations and actions by the symmetry that each trajectory's numbers draw; all else is left."""
+    env, rng = worlds.make("hover"), np.random.default_rng(0)
+    learner = Config.model_validate_json(json.dumps(runs.preset("hover") | {"lanes": 8, "minibatch_lanes": 3}))
+    shape, turns = (3, 5), jnp.asarray(rng.random((3, 2)), jnp.float32)
+    scalars = [jnp.asarray(rng.normal(size=shape), jnp.float32) for _ in range(5)]
+    observation, after = jnp.asarray(rng.normal(size=(2, *shape, 18)), jnp.float32)
+    action = jnp.asarray(rng.normal(size=(*shape, 4)), jnp.float32)
+    batch = Transition(observation, action, *scalars[:2], after, *scalars[2:])
+    turned = Trainer(env, learner)._turned(env, batch, turns)
+    for i in range(3):
+        turn = env.symmetry(turns[i])
+        for t in range(5):
+            np.testing.assert_allclose(turned.observation[i, t], turn.observation @ observation[i, t], rtol=1e-5)
+            np.testing.assert_allclose(turned.next_observation[i, t], turn.observation @ after[i, t], rtol=1e-5)
+            np.testing.assert_allclose(turned.action[i, t], turn.action @ action[i, t], rtol=1e-5)
+    rest = {"observation": 0, "next_observation": 0, "action": 0}
+    jax.tree.map(np.testing.assert_array_equal, turned._replace(**rest), batch._replace(**rest))
+    off = learner.model_copy(update={"symmetries": False})
+    jax.tree.map(np.testing.assert_array_equal, Trainer(env, off)._turned(env, batch, turns), batch)
