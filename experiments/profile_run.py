@@ -75,7 +75,7 @@ def parts(task: str) -> tuple[list[Part], Callable[[], Any], int]:
 
     def noise(tiny: chex.Array) -> Any:
         shape = (config.unroll_steps, outputs)
-        return tiny + jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), shape))(lanes.number)
+        return tiny + jax.vmap(lambda key: jax.random.normal(key, shape))(jax.random.split(key, config.lanes))
 
     def physics(tiny: chex.Array) -> Any:
         state = lanes.state.replace(obs=lanes.state.obs + tiny)  # pyright: ignore[reportAttributeAccessIssue]
