@@ -75,10 +75,8 @@ class Learner:
 
     def _set(self, hyper: Hyper) -> None:
         self.hyper = hyper
-        # One flat vector for each network: far fewer, larger operations than leaf by leaf.
-        self._optimiser = optax.flatten(
-            optax.chain(optax.clip_by_global_norm(hyper["gradient_clip"]), optax.scale_by_adam())  # pyright: ignore[reportArgumentType]
-        )
+        # For one flat vector of each network: far fewer, larger operations than leaf by leaf.
+        self._optimiser = optax.chain(optax.clip_by_global_norm(hyper["gradient_clip"]), optax.scale_by_adam())  # pyright: ignore[reportArgumentType]
 
     def init(self, key: chex.PRNGKey) -> LearnerState:
         policy_key, critic_key = jax.random.split(key)
@@ -86,7 +84,7 @@ class Learner:
         params = Networks(self.policy.init(policy_key, observation), self.critic.init(critic_key, observation))
         return LearnerState(
             params=params,
-            optimiser=Networks(self._optimiser.init(params.policy), self._optimiser.init(params.critic)),
+            optimiser=Networks(*(self._optimiser.init(ravel_pytree(network)[0]) for network in params)),
             average=params.policy,
             statistics=statistics.init_state(jnp.zeros(self.observation_size)),
             updates=jnp.int32(0),
@@ -135,19 +133,17 @@ class Learner:
         start, end = self.hyper["learning_rate"], self.hyper["learning_rate_end"]
         rate = start + self.progress(state) * (end - start)
 
-        def ascend(params: chex.ArrayTree, gradient: chex.ArrayTree, opt: chex.ArrayTree) -> tuple[chex.ArrayTree, ...]:
-            direction, opt = self._optimiser.update(gradient, opt)
-            return jax.tree.map(lambda p, d: p - rate * d, params, direction), opt
+        def ascend(params: chex.ArrayTree, gradient: chex.ArrayTree, opt: chex.ArrayTree) -> tuple[Any, ...]:
+            flat, whole = ravel_pytree(gradient)
+            direction, opt = self._optimiser.update(flat, opt)
+            return jax.tree.map(lambda p, d: p - rate * d, params, whole(direction)), opt, optax.tree.norm(flat)
 
-        policy, policy_opt = ascend(state.params.policy, gradient.policy, state.optimiser.policy)
-        critic, critic_opt = ascend(state.params.critic, gradient.critic, state.optimiser.critic)
+        policy, policy_opt, policy_norm = ascend(state.params.policy, gradient.policy, state.optimiser.policy)
+        critic, critic_opt, critic_norm = ascend(state.params.critic, gradient.critic, state.optimiser.critic)
         state = state._replace(
             params=Networks(policy, critic), optimiser=Networks(policy_opt, critic_opt), updates=state.updates + 1
         )
-        terms = terms._replace(
-            policy_gradient=optax.tree.norm(gradient.policy), value_gradient=optax.tree.norm(gradient.critic)
-        )
-        return self._averaged(state), terms
+        return self._averaged(state), terms._replace(policy_gradient=policy_norm, value_gradient=critic_norm)
 
     def _loss(self, params: Networks, state: LearnerState, batch: Transition) -> tuple[chex.Array, Terms]:
         config, hyper = self.config, self.hyper

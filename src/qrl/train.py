@@ -257,20 +257,20 @@ class Trainer:
         observed = learner.observe(state.learner, transitions.observation)
         ring = buffer.add(state.ring, transitions)
 
-        def update(now: LearnerState, drawn: tuple[chex.Array, chex.Array]) -> tuple[LearnerState, Terms]:
+        def update(now: LearnerState, drawn: tuple[chex.Array, chex.Array]) -> tuple[LearnerState, chex.Array]:
             index, turn = drawn
-            return learner.update(now, self._turned(env, buffer.gather(ring, index), turn))
+            now, terms = learner.update(now, self._turned(env, buffer.gather(ring, index), turn))
+            return now, jnp.stack(terms)
 
-        def learn(now: LearnerState) -> tuple[LearnerState, Terms]:
+        def learn(now: LearnerState) -> tuple[LearnerState, chex.Array]:
             shards = self.config.logical_shards
             keys = jax.vmap(lambda shard: jax.random.fold_in(learn_key, shard))(self._share(shards))
             each = self.config.minibatch_lanes // shards
             index = buffer.draw(ring, keys, self.config.updates_per_unroll, each)
             return jax.lax.scan(update, now, (index, self._turns(keys, index)))
 
-        def wait(now: LearnerState) -> tuple[LearnerState, Terms]:
-            zeros = jnp.zeros(self.config.updates_per_unroll)
-            return now, Terms(*[zeros] * len(Terms._fields))
+        def wait(now: LearnerState) -> tuple[LearnerState, chex.Array]:
+            return now, jnp.zeros((self.config.updates_per_unroll, len(Terms._fields)))
 
         warm = state.unrolls + 1 >= self.config.warmup_unrolls
         learned, terms = jax.lax.cond(warm, learn, wait, observed)
@@ -282,7 +282,7 @@ class Trainer:
             episodes=self._sum(jnp.sum(transitions.terminated + transitions.truncated)),
             early=self._sum(jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32)),
             updates=(learned.updates - observed.updates).astype(jnp.float32),
-            terms=jax.tree.map(jnp.sum, terms),
+            terms=Terms(*jnp.sum(terms, axis=0)),
         )
         return TrainState(
             learner=learned,
@@ -296,11 +296,12 @@ class Trainer:
             totals=jax.tree.map(jnp.add, state.totals, seen),
         )
 
-    def _fault(self, seen: Transition, terms: Terms, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
-        """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are."""
+    def _fault(self, seen: Transition, terms: chex.Array, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
+        """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are. `terms`: each
+        update's."""
         collected = self._sum(jnp.stack([jnp.sum(~jnp.isfinite(x)) for x in (seen.reward, seen.next_observation)])) == 0
         finite = jnp.concatenate(
-            [jnp.tile(collected, (self.config.updates_per_unroll, 1)), jnp.isfinite(jnp.stack(terms, axis=1))], axis=1
+            [jnp.tile(collected, (self.config.updates_per_unroll, 1)), jnp.isfinite(terms)], axis=1
         )
         first = jnp.argmin(finite.reshape(-1))
         update, term = first // finite.shape[1], first % finite.shape[1]
