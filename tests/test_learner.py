@@ -38,7 +38,7 @@ def batch(seed: int = 0, ends_within: bool = True) -> Transition:
         next_observation=np.where(ended[..., None], rng.normal(size=(B, T, F)), observation[:, 1:]),
         terminated=terminated,
         truncated=truncated,
-        early=truncated & (np.cumsum(truncated) % 2 == 0).reshape(B, T),
+        out_of_bounds=truncated & (np.cumsum(truncated) % 2 == 0).reshape(B, T),
     )
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
 
@@ -72,7 +72,7 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
         for i in reversed(range(T)):
             carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
             for_ever = c.reward_scale * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
-            after = for_ever if d.early[b, i] else v_next[b, i]
+            after = for_ever if d.out_of_bounds[b, i] else v_next[b, i]
             bootstrap = 0.0 if d.terminated[b, i] else after
             a_trace[b, i] = c.reward_scale * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
             carried = (min(1.0, ratio[b, i]) if off_policy else 1.0) * a_trace[b, i]
@@ -140,7 +140,7 @@ def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[ja
     after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
     log_pi = log_density(data.action, learner.policy.apply(state.params.policy, data.observation), c.sigma)
     rho = jnp.exp(log_pi - data.log_mu)
-    after = jnp.where(data.early > 0, c.reward_scale * data.reward / (1.0 - c.gamma), after)
+    after = jnp.where(data.out_of_bounds > 0, c.reward_scale * data.reward / (1.0 - c.gamma), after)
     return jax.vmap(lambda *x: vtrace(*x, gamma=c.gamma, lam=c.lam))(
         c.reward_scale * data.reward, value, after, data.terminated, data.truncated, rho
     )

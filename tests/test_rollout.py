@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,10 +58,18 @@ class Fenced(Env):
 
 
 class Marked(Fenced):
-    """The same; leaving in y is a truncation by the environment's own word, and a restart keeps gain and fence."""
+    """The same; leaving in y is a truncation by the environment's own word, and a restart keeps gain and fence.
+
+    Where x is positive too, it says that nothing begins there any more.
+    """
 
     def at(self, x: jax.Array) -> State:
-        return super().at(x).replace(info={"truncated": jnp.float32(x[Y] > x[FENCE])})
+        left = x[Y] > x[FENCE]
+        return (
+            super()
+            .at(x)
+            .replace(info={"truncated": jnp.float32(left), "out_of_bounds": jnp.float32(left & (x[X] > 0.0))})
+        )
 
     def restart(self, state: State, rng: jax.Array) -> State:
         kept = state.pipeline_state[GAIN:]
@@ -157,7 +165,7 @@ def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
             np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-5, atol=1e-5)
             assert (steps.terminated[i, t], steps.truncated[i, t]) == (terminated, truncated)
-            assert steps.early[i, t] == (bool(state.done) and truncated)
+            assert steps.out_of_bounds[i, t] == (bool(state.done) and bool(state.info.get("out_of_bounds", 0.0)))
             if (terminated or truncated) and t + 1 < UNROLLS * T:
                 seen += [terminated, bool(state.done) and truncated, not bool(state.done)]
                 state, age = flight.env.at(steps.observation[i, t + 1]), 0
@@ -332,6 +340,27 @@ def test_the_longest_episode_is_the_configured_else_the_tasks_else_1000() -> Non
     assert rollout.episode_steps(worlds.make("hover"), 77) == 77
     assert rollout.episode_steps(worlds.make("hover"), None) == 200
     assert rollout.episode_steps(PLAIN, None) == 1000
+
+
+@pytest.mark.parametrize("lanes", [8, 9], ids=["two blocks of 4", "three of 3"])
+def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more lanes than a block's most, each lane does, to rounding, what it does among all at once.
+
+    But for when its next start is drawn, which is when some lane beside it needs one.
+    """
+    env = Marked()
+
+    def run() -> tuple[Any, ...]:
+        key = jax.random.PRNGKey(3)
+        begun = rollout.begin(env, key, jnp.arange(lanes), lanes, LONGEST, T)
+        mean, sigma = (lambda observation: jnp.zeros((*observation.shape[:-1], env.action_size))), jnp.float32(0.5)
+        after, steps = rollout.unroll(env, begun, mean, sigma, key, key, unroll_steps=3 * T, longest=LONGEST)
+        return steps, after.state, after.steps, after.ended, after.start + after.used, after.early
+
+    at_once = jax.jit(run)()
+    monkeypatch.setattr(rollout, "BLOCK_LANES", 4)
+    in_blocks = jax.jit(lambda: run())()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), in_blocks, at_once)
 
 
 def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:

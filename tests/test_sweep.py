@@ -349,7 +349,7 @@ def test_vmapped_members_agree_with_members_in_turn(tmp_path: Path, monkeypatch:
     points = stack([point(worlds.from_task(_task(p)), p.learner) for p in grid.points])
 
     def last(in_turn: bool) -> train.TrainState:
-        monkeypatch.setattr(train, "_in_turn", lambda: in_turn)
+        monkeypatch.setattr(train, "_in_turn", lambda _: in_turn)
         trainer = Trainer(worlds.make("pendulum"), config)
         return trainer.advance(trainer.init(laps.seeds(0, 4), points), points, np.int32(config.unrolls))
 

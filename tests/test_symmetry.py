@@ -97,6 +97,16 @@ def test_a_lopsided_vehicle_has_no_symmetry_that_moves_its_odd_motor(broken: dic
         np.testing.assert_array_equal(turn.observation, np.eye(18))
 
 
+def test_two_motors_in_one_place_leave_the_task_as_it_is() -> None:
+    """Which of them moves where cannot be said: no turn, and no action counted twice."""
+    motors = [motor.model_dump(mode="json") for motor in tasks.load("hover").vehicle.motors]  # pyright: ignore[reportAttributeAccessIssue]
+    env = changed("hover", {"motors": [motors[0], motors[0], *motors[2:]]})
+    for u in np.random.default_rng(0).random((8, 2)):
+        turn = env.symmetry(jnp.asarray(u, jnp.float32))
+        np.testing.assert_array_equal(turn.action, np.eye(4))
+        np.testing.assert_array_equal(turn.observation, np.eye(18))
+
+
 def test_the_circle_is_turned_by_any_angle() -> None:
     """About z, evenly: its directions average out."""
     env = worlds.make("circle")

@@ -3,8 +3,8 @@
 `state.pipeline_state` is a `Lane`: the lane's own task (physics, reward weights, start ranges, bounds) travels
 with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` offers `restart` (a
 fresh start that keeps the lane's task), `under` (the same world with other parameters) and `evaluation`. An
-episode that ends early by leaving the bounds has `done = 1` and `info["truncated"] = 1`: whoever bootstraps
-should treat it as a truncation.
+episode that ends early by leaving the bounds has `done = 1`, and `truncated = 1` and `out_of_bounds = 1` in `info`:
+whoever bootstraps should treat it as a truncation, and should not trust a value function there.
 """
 
 import abc
@@ -99,7 +99,7 @@ class TaskEnv(Env):
             obs=self._observe(x),
             reward=reward,
             done=done,
-            info={**state.info, "truncated": done},
+            info={**state.info, "truncated": done, "out_of_bounds": done},
         )
 
     def symmetry(self, u: chex.Array) -> Symmetry:
@@ -109,7 +109,9 @@ class TaskEnv(Env):
     def _begin(self, params: Params, rng: chex.PRNGKey) -> State:
         x = self._draw(params, rng)
         zero = jnp.float32(0.0)
-        return State(Lane(x, params), self._observe(x), zero, zero, metrics={}, info={"truncated": zero})
+        return State(
+            Lane(x, params), self._observe(x), zero, zero, metrics={}, info={"truncated": zero, "out_of_bounds": zero}
+        )
 
     @abc.abstractmethod
     def _draw(self, params: Params, rng: chex.PRNGKey) -> Any: ...

@@ -59,19 +59,19 @@ def _of_vehicle(physics: Physics, candidates: np.ndarray, u: chex.Array) -> tupl
     bodies = jnp.asarray(candidates)
     motors, same = jax.vmap(lambda body: _motors(physics, body))(bodies)
     nth = jnp.floor(u * jnp.sum(same)) + 1.0
-    index = jnp.argmax(jnp.cumsum(same) == nth)
-    return bodies[index], motors[index]
+    index = jnp.argmax(jnp.cumsum(same) == nth)  # 0, the identity, where none is the same: two motors in one place
+    return bodies[index], jnp.where(same[index], motors[index], jnp.eye(motors.shape[-1]))
 
 
 def _motors(physics: Physics, body: chex.Array) -> tuple[chex.Array, chex.Array]:
     """Which motor [A, A] comes to be where another was, and whether the turned vehicle is the same."""
-    moved = physics.motor_position_m @ body[:2, :2].T
+    moved = jnp.sum(physics.motor_position_m[:, None] * body[:2, :2], axis=-1)  # exact, as a GPU's product is not
     apart = jnp.abs(physics.motor_position_m[:, None] - moved[None]).max(axis=-1)
     spin = _determinant(body) * physics.motor_spin
     alike = (physics.motor_spin[:, None] == spin) & (physics.motor_max_N[:, None] == physics.motor_max_N)
     motors = ((apart < SAME_M) & alike).astype(jnp.float32)
     onto = jnp.all(motors.sum(axis=0) == 1.0) & jnp.all(motors.sum(axis=1) == 1.0)
-    return motors, onto & jnp.all(body**2 @ physics.inertia_kg_m2 == physics.inertia_kg_m2)
+    return motors, onto & jnp.all(jnp.sum(body**2 * physics.inertia_kg_m2, axis=-1) == physics.inertia_kg_m2)
 
 
 def _observation(world: chex.Array, body: chex.Array) -> chex.Array:

@@ -136,7 +136,8 @@ class Learner:
         def ascend(params: chex.ArrayTree, gradient: chex.ArrayTree, opt: chex.ArrayTree) -> tuple[Any, ...]:
             flat, whole = ravel_pytree(gradient)
             direction, opt = self._optimiser.update(flat, opt)
-            return jax.tree.map(lambda p, d: p - rate * d, params, whole(direction)), opt, optax.tree.norm(flat)
+            moved = jax.tree.map(lambda p, d: p - rate * d, params, whole(jnp.asarray(direction)))
+            return moved, opt, optax.tree.norm(flat)
 
         policy, policy_opt, policy_norm = ascend(state.params.policy, gradient.policy, state.optimiser.policy)
         critic, critic_opt, critic_norm = ascend(state.params.critic, gradient.critic, state.optimiser.critic)
@@ -163,7 +164,7 @@ class Learner:
         # Beyond an environment's own bounds no transition begins, and so V is never fitted there: bootstrapped from, it
         # drew policies out and grew without end. In its place the last reward, for ever.
         for_ever = reward / jnp.maximum(1.0 - hyper["gamma"], MIN_DISCOUNTING)
-        next_value = jnp.where(batch.early > 0, for_ever, next_value)
+        next_value = jnp.where(batch.out_of_bounds > 0, for_ever, next_value)
         mean = _apply(self.policy, params.policy, observation)
         log_pi = log_density(flat(batch.action), mean, self.sigma(state)).reshape(samples)
         log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)

@@ -16,7 +16,7 @@ from brax.envs.base import Env, State
 from qrl.networks import log_density
 from qrl.types import Transition
 
-BLOCK_LANES = 512  # stepped at a time on a CPU: with more, what passes between the steps leaves its cache
+BLOCK_LANES = 512  # at most, stepped at a time on a CPU: with more, what passes between the steps leaves its cache
 
 
 class Lanes(NamedTuple):
@@ -101,14 +101,16 @@ def unroll(
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last
     step is `terminated` if the environment says done, and `truncated` if it reached `longest` or if the
-    environment marks its own end with info["truncated"]; it is then `early` too. The noise follows from `key`,
-    which is this unroll's own; starts from `starts`, which is the key that `begin` had.
+    environment marks its own end with info["truncated"], or with info["out_of_bounds"] where no transition begins any
+    more. The noise follows from `key`, which is this unroll's own; starts from `starts`, which is the key that `begin`
+    had.
     """
     count = lanes.number.shape[0]
     one = functools.partial(_unroll, env, mean, sigma, key, starts, unroll_steps, longest)
-    if jax.default_backend() != "cpu" or count <= BLOCK_LANES or count % BLOCK_LANES:
+    block = max((size for size in range(1, BLOCK_LANES + 1) if count % size == 0), default=count)
+    if jax.default_backend() != "cpu" or count <= BLOCK_LANES or block < BLOCK_LANES // 8:
         return one(lanes)
-    blocks = jax.tree.map(lambda x: x.reshape(-1, BLOCK_LANES, *x.shape[1:]), lanes)
+    blocks = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), lanes)
     return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), jax.lax.map(one, blocks))
 
 
@@ -132,8 +134,8 @@ def _unroll(
         state = jax.vmap(env.step)(lanes.state, jnp.clip(action, -1.0, 1.0))
         steps = lanes.steps + 1
         done = state.done.astype(bool)
-        own_truncation = jnp.asarray(state.info.get("truncated", jnp.zeros_like(done))).astype(bool)
-        terminated = done & ~own_truncation
+        out_of_bounds = _said(state, "out_of_bounds")
+        terminated = done & ~_said(state, "truncated") & ~out_of_bounds
         ended = done | (steps >= longest)
         transition = Transition(
             observation=observation,
@@ -143,10 +145,15 @@ def _unroll(
             next_observation=state.obs,
             terminated=terminated.astype(jnp.float32),
             truncated=(ended & ~terminated).astype(jnp.float32),
-            early=(done & own_truncation).astype(jnp.float32),
+            out_of_bounds=(done & out_of_bounds).astype(jnp.float32),
         )
         early = lanes.early + (done & (steps < longest))
         return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition
 
     lanes, transitions = jax.lax.scan(step, lanes, jnp.swapaxes(noise(lanes.number), 0, 1))
     return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)
+
+
+def _said(state: State, name: str) -> chex.Array:
+    """What an environment may say of its state in `info`: bool [N]."""
+    return jnp.asarray(state.info.get(name, jnp.zeros_like(state.done))).astype(bool)

@@ -171,7 +171,7 @@ class Trainer:
         return _over_members(lambda m: self._init(m[0], m[1]), (seeds, points))
 
     def _advance_all(self, states: TrainState, points: Point, until: chex.Array) -> TrainState:
-        if _in_turn():
+        if _in_turn(len(states.unrolls)):
             return _over_members(lambda m: self._advance(m[0], m[1], until), (states, points))
         # All members are equally far, and their counters stay without a member axis: batched, they would turn every
         # insert into the ring into a scatter, and the loop into a selection over the whole state.
@@ -244,11 +244,15 @@ class Trainer:
         symmetry = getattr(env, "symmetry", None)
         if not (self.config.symmetries and symmetry):
             return batch
+
+        def turned(x: chex.Array, by: chex.Array) -> chex.Array:
+            return jnp.matmul(x, by.swapaxes(1, 2), precision="highest")  # a GPU's own would round to ten bits
+
         under = jax.vmap(symmetry)(turns)
         return batch._replace(
-            observation=batch.observation @ under.observation.swapaxes(1, 2),
-            next_observation=batch.next_observation @ under.observation.swapaxes(1, 2),
-            action=batch.action @ under.action.swapaxes(1, 2),
+            observation=turned(batch.observation, under.observation),
+            next_observation=turned(batch.next_observation, under.observation),
+            action=turned(batch.action, under.action),
         )
 
     def _unroll_and_learn(self, learner: Learner, env: Env, state: TrainState) -> TrainState:
@@ -320,10 +324,11 @@ def _effort(level: int) -> dict[str, Any]:
     return {"xla_backend_optimization_level": level} if jax.default_backend() == "cpu" and not least else {}
 
 
-def _in_turn() -> bool:
-    """Whether members run one after the other, as is fastest on a CPU."""
-    return jax.default_backend() == "cpu"
+def _in_turn(members: int) -> bool:
+    """Whether members run one after the other, as is fastest on a CPU; one alone does: its branches stay branches."""
+    return members == 1 or jax.default_backend() == "cpu"
 
 
 def _over_members(one: Callable[[Any], Any], members: Any) -> Any:
-    return jax.lax.map(one, members) if _in_turn() else jax.vmap(one)(members)
+    in_turn = _in_turn(len(jax.tree.leaves(members)[0]))
+    return jax.lax.map(one, members) if in_turn else jax.vmap(one)(members)

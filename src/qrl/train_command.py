@@ -55,6 +55,8 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
     """What is to be trained, and where, the folder ours `until_done`; None: nothing is left to do."""
     flags = _flags(args)
     file = request.config_file(args.config)
+    if args.preset:
+        file = file.model_copy(update={"learner": request.preset(args.preset, "--preset") | file.learner})
     config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds)
     out: Path = args.out or Path("runs") / config.task.name
     if out.exists() and not out.is_dir():
@@ -99,10 +101,8 @@ def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, b
 
 
 def _flags(args: argparse.Namespace) -> dict[str, Any]:
-    """The learner's flags that were given, each read as JSON or a number where it is one, else as text; under them a
-    preset's.
-    """
-    given: dict[str, Any] = request.preset(args.preset, "--preset") if args.preset else {}
+    """The learner's flags that were given, each read as JSON or a number where it is one, else as text."""
+    given: dict[str, Any] = {}
     for name, text in vars(args).items():
         if name.startswith("learner.") and text is not None:
             given[name.removeprefix("learner.")] = _value(text)

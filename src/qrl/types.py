@@ -15,7 +15,7 @@ class Transition(NamedTuple):
     next_observation: chex.Array  # [..., F] after the step, before any reset: the next `observation` but at an end
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
-    early: chex.Array  # [...] float 0 or 1: truncated by the environment itself, out of its bounds
+    out_of_bounds: chex.Array  # [...] float 0 or 1: truncated where no transition of the environment begins any more
 
 
 class Networks(NamedTuple):
