@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrl import grid, request
+from qrl import grid, request, runs
 from qrl.axes import Axis
 from qrl.config import TRACED, Config
 from qrl_envs.specfile import BadInput
@@ -32,7 +32,7 @@ def test_every_hyperparameter_is_declared_traced_or_static() -> None:
     """Once each; counts, shapes and choices can only be static, and what is traced is a number or numbers."""
     for name, field in Config.model_fields.items():
         assert len({"traced", "static"} & set(field.metadata)) == 1, name
-    config = Config.model_validate(request.preset(request.task_record("hover"), ""), strict=False)
+    config = Config.model_validate(request.task_preset(request.task_record("hover"), ""), strict=False)
     assert set(TRACED) - set(config.traced) == {"xi"}  # null there
     assert all(isinstance(v, float) or all(isinstance(x, float) for x in v) for v in config.traced.values())
     assert not set(config.static) & set(TRACED)
@@ -105,13 +105,15 @@ def test_a_path_reaches_into_the_vehicle(tmp_path: Path) -> None:
 
 
 def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
-    named = {"ours": {}, "PPO": {"ring_unrolls": 1, "lam": 0.95}}
+    named = {"ours": {}, "PPO": {"ring_unrolls": 1, "lam": 0.93}}
+    preset = runs.preset("pendulum")
+    ours = ("ours", preset["ring_unrolls"], preset["lam"])
     found = load(tmp_path, {"task": "pendulum", "axes": {"method": named, "gamma": [0.9, 0.99]}})
     assert [(p.place["method"], p.learner.ring_unrolls, p.learner.lam) for p in found.points] == [
-        ("ours", 16, 1.0),
-        ("ours", 16, 1.0),
-        ("PPO", 1, 0.95),
-        ("PPO", 1, 0.95),
+        ours,
+        ours,
+        ("PPO", 1, 0.93),
+        ("PPO", 1, 0.93),
     ]
 
 
