@@ -13,10 +13,11 @@ import pytest
 
 import bench
 import judge
+import qrl_command
 from bench_contestants import CONTESTANTS, Contestant, chosen
 from bench_install import fingerprint, python_of
 from bench_plot import bars, plot
-from bench_tables import Spread, cell, first_at, page, ratios, spread, to_solve
+from bench_tables import Spread, cell, derived, first_at, page, ratios, spread, to_solve
 from qrl_envs import env as worlds
 
 
@@ -156,6 +157,33 @@ def test_the_page_tells_all(tmp_path: Path) -> None:
     assert "abacus" in text
     plot(tmp_path / "bench.png", RUNS)
     assert (tmp_path / "bench.png").stat().st_size > 10_000
+
+
+def test_rates_are_held_against_each_other() -> None:
+    def rates(name: str, seed: int, **found: float) -> dict:
+        lines = [{"figure": figure.replace("_", ", "), "per_second": value} for figure, value in found.items()]
+        return run(name, seed, *lines, group="speed")
+
+    one = [rates("qrl", s, training=10.0 + s, acting_256=4.0, acting_1024=5.0, acting_4096=4.5) for s in range(3)]
+    two = [rates("qrl, two devices", s, training=20.0) for s in range(2)]
+    text = derived([*one, *two])
+    assert "| training, two devices, over one | qrl | 1.91× [1.82 … 2] |" in text
+    assert "dearest of 3 numbers of lanes over the cheapest | qrl | 1.25× [1.25 … 1.25] |" in text
+    assert derived([]) == ""
+
+
+def test_a_command_tells_the_worst_of_its_checkpoints() -> None:
+    checkpoints = [{"rms_position_m": 0.001}, {"rms_position_m": 0.004}, {"rms_position_m": 0.002}]
+    nominal = {"success": 1.0, "rms_position_m": 0.001, "return_min": 3.0}
+    off = {"latency": {"success": 0.99}, "noise": {"success": 0.98}}
+    assert qrl_command.told({**nominal, "checkpoints": checkpoints, "off_nominal": off}) == {
+        "success": 1.0,
+        "rms_position_m": 0.001,
+        "worst_of_3_rms_position_m": 0.004,
+        "off_nominal_success_latency": 0.99,
+        "off_nominal_success_noise": 0.98,
+    }
+    assert qrl_command.told({**nominal, "checkpoints": [{"rms_position_m": None}]})["worst_of_1_rms_position_m"] is None
 
 
 def test_a_peer_that_never_solves_gets_a_bound_in_the_picture() -> None:
