@@ -227,14 +227,22 @@ def test_a_run_leaves_its_lines_and_ends_on_time(tmp_path: Path, monkeypatch: py
 
 
 def test_a_run_is_made_once(tmp_path: Path) -> None:
-    """And again if it failed, or was asked for otherwise."""
+    """And again if it failed, was asked for otherwise, or elsewhere."""
     peer, path = Contestant("peer", "pendulum", "peer.py", ("--steps", "1")), tmp_path / "run.json"
     assert not bench.made(path, peer, 60.0)
-    kept = {"command": ["peer.py", "--steps", "1"], "budget_seconds": 60.0, "outcome": "done"}
+    here = bench.circumstances(peer)
+    assert "commit" not in here
+    asked = {"command": ["peer.py", "--steps", "1"], "budget_seconds": 60.0}
+    kept = asked | {"circumstances": here, "outcome": "done"}
     path.write_text(json.dumps(kept))
     assert bench.made(path, peer, 60.0)
     assert not bench.made(path, peer, 90.0)
     assert not bench.made(path, peer._replace(words=("--steps", "2")), 60.0)
+    for other in ({"CPU": "abacus"}, {"jax": "0.1"}, {"requirements": "others"}):
+        path.write_text(json.dumps(kept | {"circumstances": here | other}))
+        assert not bench.made(path, peer, 60.0)
+    path.write_text(json.dumps(asked | {"outcome": "done"}))
+    assert not bench.made(path, peer, 60.0)
     path.write_text(json.dumps(kept | {"outcome": "exit code 1"}))
     assert not bench.made(path, peer, 60.0)
 
