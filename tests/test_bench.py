@@ -10,8 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax import envs
 
 import bench
+import brax_ppo
 import judge
 import qrl_command
 from bench_contestants import CONTESTANTS, Contestant, chosen
@@ -114,6 +116,22 @@ def test_the_clock_leaves_out_checks_and_compilation(
     assert [line["train_seconds"] for line in lines] == [5.0, 9.0]
     assert [line["compile_seconds"] for line in lines] == [5.0, 5.0]
     assert [line["total_seconds"] for line in lines] == [20.0, 24.0]
+
+
+def test_brax_is_told_of_truncations() -> None:
+    """Out of bounds, and not otherwise; and its lane starts anew all the same."""
+    env = brax_ppo.wrapped(envs.get_environment("hover"), episode_length=2)
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    lane = state.pipeline_state
+    pose = lane.x.pose
+    far = lane.x._replace(pose=pose._replace(position_m=pose.position_m.at[1].set(1e3)))
+    step = jax.jit(env.step)
+    state = step(state.replace(pipeline_state=lane._replace(x=far)), jnp.zeros((3, 4)))
+    np.testing.assert_array_equal(state.done, [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(state.info["truncation"], [0.0, 1.0, 0.0])
+    np.testing.assert_array_equal(state.obs[1], state.info["first_obs"][1])
+    state = step(state, jnp.zeros((3, 4)))  # the time limit of the others
+    np.testing.assert_array_equal(state.info["truncation"], [1.0, 0.0, 1.0])
 
 
 def test_solved_is_the_first_check_that_reaches_the_bar() -> None:
