@@ -1,7 +1,7 @@
 """What qrl does in a second: `throughput.py [--only acting physics learning training] --seed N`.
 
 acting     policy 64-64, noise, physics, reward, fresh starts and recording: `rollout.unroll` of hover
-physics    the quadrotor's step alone, thrusts about those of a hover
+physics    the quadrotor's step alone, thrusts about those of a hover, in blocks of lanes as `rollout.unroll` has them
 learning   samples through draw, gather, symmetries, both networks, V-trace, loss, clip and Adam: `Learner.update` on
            the ring of a run on its way
 training   environment steps of the whole loop, each sample learnt from as often as by Brax PPO's defaults (16
@@ -12,7 +12,7 @@ training   environment steps of the whole loop, each sample learnt from as often
 import argparse
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -73,25 +73,40 @@ def physics(lanes: int, key: jax.Array) -> None:
     params: Any = env.params
     dt_s = env.task.control_period_s
 
+    blocks = max(1, lanes // rollout.BLOCK_LANES)
+
     @partial(jax.jit, compiler_options=_effort(1))
     def steps(params: Any, thrusts: Any, bodies: Any) -> Any:
         each = jax.vmap(lambda body, thrust: quadrotor.step(params, body, thrust, dt_s))
-        return jax.lax.scan(lambda b, thrust: (each(b, thrust), None), bodies, thrusts)[0]
 
-    bodies = jax.vmap(lambda k: quadrotor.draw(params.start, k))(jax.random.split(key, lanes))
-    about = 1.0 + 0.01 * jax.random.normal(key, (UNROLL_STEPS, lanes, 4))
+        def block(of: Any) -> Any:
+            return jax.lax.scan(lambda b, thrust: (each(b, thrust), None), *of)[0]
+
+        return jax.lax.map(block, (bodies, thrusts))
+
+    draw = jax.vmap(jax.vmap(lambda k: quadrotor.draw(params.start, k)))
+    bodies = draw(jax.random.split(key, (blocks, lanes // blocks)))
+    about = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
     thrusts = quadrotor.hover_thrust_N(params.physics) * about
     step = partial(steps, jax.tree.map(jnp.asarray, params.physics), thrusts)
     rate(f"physics, {lanes:,} lanes", lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
 
 
+@cache
+def on_its_way() -> Any:
+    """A hover run's learner, full ring and point, when it has just been filled."""
+    run = hover()
+    trainer, states, points = begun(run)
+    advance = laps.compile_advance(trainer, states, points)
+    states = advance(states, points, np.int32(run.learner.ring_unrolls))
+    return jax.tree.map(lambda x: jnp.array(x[0]), (states.learner, states.ring, points))
+
+
 def learning(minibatch_lanes: int, key: jax.Array) -> None:
     run = hover(minibatch_lanes=minibatch_lanes)
-    trainer, states, points = begun(run)
-    config, updates, shards = run.learner, 64, run.learner.logical_shards
-    advance = laps.compile_advance(trainer, states, points)
-    states = advance(states, points, np.int32(config.ring_unrolls))
-    state, ring, here = jax.tree.map(lambda x: jnp.array(x[0]), (states.learner, states.ring, points))
+    trainer = Trainer(request.environment(run.task), run.learner)
+    updates, shards = 64, run.learner.logical_shards
+    state, ring, here = on_its_way()
 
     @partial(jax.jit, compiler_options=_effort(1))
     def learn(ring: Any, here: Any, carry: Any) -> Any:
