@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from bench_contestants import CONTESTANTS, Contestant, chosen, key
-from bench_install import NotInstalled, python_of
+from bench_install import NotInstalled, fingerprint, python_of
 from bench_plot import plot
 from bench_tables import Run, page
 from qrl import runs as records
@@ -107,16 +107,27 @@ def installed(
 
 
 def made(path: Path, contestant: Contestant, budget_seconds: float) -> bool:
-    """Whether this very run is there, and did not fail. Which commit's it is, it says, and so does the page."""
+    """Whether this very run is there, of this machine and these versions, and did not fail.
+
+    Which commit's it is makes no difference: it says so, and so does the page.
+    """
     if not path.exists():
         return False
     run = json.loads(path.read_text())
     same = run["command"] == command(contestant) and run["budget_seconds"] == budget_seconds
-    return same and run["outcome"] in FINISHED
+    return same and run.get("circumstances") == circumstances(contestant) and run["outcome"] in FINISHED
 
 
 def command(contestant: Contestant) -> list[str]:
     return [contestant.script, *contestant.words]
+
+
+def circumstances(contestant: Contestant) -> dict[str, Any]:
+    """What must be the same for a run to be like another: machine and versions; a peer's are its requirements."""
+    here = {name: value for name, value in machine().items() if name != "commit"}
+    if contestant.environment is None:
+        return here
+    return here | {"requirements": fingerprint(PEERS / f"{contestant.environment}.txt")}
 
 
 def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, cache: Path) -> Run:
@@ -143,6 +154,7 @@ def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, 
     said = (err.strip().splitlines() or [""])[-1][:300] if outcome.startswith("exit") else ""
     who = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
     how = {"command": command(contestant), "budget_seconds": budget_seconds, "commit": records.commit(), "load": load}
+    how["circumstances"] = circumstances(contestant)
     return {**who, **how, "outcome": outcome, "said": said, "lines": lines}
 
 

@@ -32,6 +32,7 @@ CONTESTANTS = (
     Contestant("qrl", "hover", "qrl_train.py", ("hover",)),
     Contestant("Brax PPO", "hover", "brax_ppo.py", ("hover", "--steps", "4e6"), "brax"),
     Contestant("qrl", "circle", "qrl_train.py", ("circle",)),
+    Contestant("Brax PPO", "circle", "brax_ppo.py", ("circle", "--steps", "3e6"), "brax"),
     Contestant("qrl train pendulum", "commands", "qrl_command.py", ("pendulum",)),
     Contestant("qrl train hover", "commands", "qrl_command.py", ("hover",)),
     Contestant("qrl train circle", "commands", "qrl_command.py", ("circle",)),

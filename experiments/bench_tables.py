@@ -14,7 +14,15 @@ from bench_contestants import GROUPS, QRL
 Run = dict[str, Any]
 CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
 BARS = {"pendulum": ("return_mean", -150.0), "hover": ("success", 0.99), "circle": ("success", 0.99)}
+TWO_DEVICES = ", two devices"  # how such a contestant's name, and so its figures, end
 EASIER_PENDULUM = -160.0  # at which the field's figures were taken
+TUNED = (
+    "**Whose settings.** qrl races with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
+    " `circle_fast`); its commands use the presets that ship as these tasks' defaults. Brax PPO's were tuned by hand"
+    " for the pendulum, as Brax ships none that suit; on hover and circle it has the same with more lanes and a longer"
+    " horizon, and no search was made there. rejax: its own for this task. sbx: the RL Zoo's for this task. rltools:"
+    " the package's defaults, made for this task."
+)
 
 
 class Spread(NamedTuple):
@@ -102,13 +110,11 @@ def race(runs: list[Run], group: str) -> str:
 
 
 def commands(runs: list[Run]) -> str:
-    """Whole commands: everything that their last line holds."""
-    rows: list[list[str]] = []
+    """Whole commands: everything that their last line holds, a row each."""
     names = list(dict.fromkeys(name for run in runs for name in _last(run)))
-    for who in _names(runs):
-        mine = [_last(run) for run in runs if run["contestant"] == who]
-        rows.append([who, *(_of(mine, name) for name in names)])
-    return _table(["", *(name.replace("_", " ") for name in names)], rows)
+    each = {who: [_last(run) for run in runs if run["contestant"] == who] for who in _names(runs)}
+    rows = [[name.replace("_", " "), *(_of(lines, name) for lines in each.values())] for name in names]
+    return _table(["", *each], rows)
 
 
 def _last(run: Run) -> dict[str, float]:
@@ -144,6 +150,24 @@ def speed(runs: list[Run]) -> str:
     return _table(["", "", "a second, or seconds", "qrl / this"], rows)
 
 
+def derived(runs: list[Run]) -> str:
+    """What a contestant's rates say of each other: two devices over one, and how acting's cost depends on lanes."""
+    found, rows = figures(runs), []
+    for figure, values in found.items():
+        for who, two in values.items():
+            if figure.endswith(TWO_DEVICES):
+                one = found.get(figure.removesuffix(TWO_DEVICES), {}).get(who, {})
+                rows.append([f"{figure}, over one", who, cell(ratios(two, one), "×")])
+    acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
+    for who in dict.fromkeys(who for values in acting for who in values):
+        each = [values[who] for values in acting if who in values]
+        seeds = set.intersection(*(set(rates) for rates in each))
+        most, least = ({s: f(rates[s] for rates in each) for s in sorted(seeds)} for f in (max, min))
+        told = f"acting, a step's cost at the dearest of {len(each)} numbers of lanes over the cheapest"
+        rows.append([told, who, cell(ratios(most, least), "×")])
+    return _table(["", "", "ratio"], rows) if rows else ""
+
+
 def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> str:
     """bench.md."""
     said = "; ".join(f"{name} {value}" for name, value in machine.items())
@@ -155,11 +179,14 @@ def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> st
         " then spread likewise. *not*: most runs did not solve it within their budget."
         " Clocks: experiments/peers/judge.py."
     )
+    parts.append(TUNED)
     for group, title in GROUPS.items():
         mine = [run for run in runs if run["group"] == group]
         if mine:
             made = race(mine, group) if group in BARS else commands(mine) if group == "commands" else speed(mine)
             parts += [f"## {title}", made]
+            if group == "speed" and (more := derived(mine)):
+                parts.append(more)
     broken = [run for run in runs if run["outcome"] not in ("done", "out of time")]
     if absent or broken:
         told = [f"- {name}: not installed: {why}" for name, why in absent.items()]

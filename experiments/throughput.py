@@ -1,15 +1,18 @@
 """What qrl does in a second: `throughput.py [--only acting physics learning training] --seed N`.
 
 acting     policy 64-64, noise, physics, reward, fresh starts and recording: `rollout.unroll` of hover
-physics    the quadrotor's step alone, constant thrust
-learning   samples through gather, both networks, V-trace, loss, clip and Adam: `Learner.update`
-training   environment steps of the whole loop, each sample learnt from as often as by Brax PPO's defaults: 16
-           minibatches an unroll, two passes
+physics    the quadrotor's step alone, thrusts about those of a hover, in blocks of lanes as `rollout.unroll` has them
+learning   samples through draw, gather, symmetries, both networks, V-trace, loss, clip and Adam: `Learner.update` on
+           the ring of a run on its way
+training   environment steps of the whole loop, each sample learnt from as often as by Brax PPO's defaults (16
+           minibatches an unroll, two passes): with unrolls of 50 steps, and of Brax's 10, which makes as many
+           optimiser steps a step of the environment
 """
 
 import argparse
 import sys
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +24,10 @@ import numpy as np
 
 from qrl import buffer, laps, request, rollout, runs
 from qrl.learner import Learner
-from qrl.train import Trainer, point, spread, stack
+from qrl.train import Trainer, _effort, point, spread, stack
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
-from rates import LANES, UNROLL_STEPS, rate
+from rates import LANES, TRAINING, UNROLL_STEPS, rate
 
 BRAX_MINIBATCHES, BRAX_PASSES = 16, 2
 TRAINING_LANES = 512
@@ -43,8 +46,8 @@ def acting(lanes: int, key: jax.Array) -> None:
     state = learner.init(key)
     longest = rollout.episode_steps(env, run.learner.episode_steps)
 
-    @jax.jit
-    def unroll(carry: Any) -> Any:
+    @partial(jax.jit, compiler_options=_effort(1))
+    def unroll(state: Any, starts: Any, carry: Any) -> Any:
         now, key, _ = carry
         key, mine = jax.random.split(key)
         now, seen = rollout.unroll(
@@ -61,67 +64,94 @@ def acting(lanes: int, key: jax.Array) -> None:
 
     starts = jax.random.PRNGKey(1)
     first = rollout.begin(env, starts, jnp.arange(lanes, dtype=jnp.int32), lanes, longest, UNROLL_STEPS)
-    rate(f"acting, {lanes:,} lanes", lanes * UNROLL_STEPS, unroll, (first, key, None), jax.block_until_ready)
+    act = partial(unroll, state, starts)
+    rate(f"acting, {lanes:,} lanes", lanes * UNROLL_STEPS, act, (first, key, None), jax.block_until_ready)
 
 
 def physics(lanes: int, key: jax.Array) -> None:
     env = worlds.make("hover")
     params: Any = env.params
     dt_s = env.task.control_period_s
-    thrust = quadrotor.hover_thrust_N(params.physics) * jnp.ones(4)
 
-    @jax.jit
-    def steps(bodies: Any) -> Any:
-        each = jax.vmap(lambda body: quadrotor.step(params.physics, body, thrust, dt_s))
-        return jax.lax.scan(lambda b, _: (each(b), None), bodies, None, UNROLL_STEPS)[0]
+    blocks = max(1, lanes // rollout.BLOCK_LANES)
 
-    bodies = jax.vmap(lambda k: quadrotor.draw(params.start, k))(jax.random.split(key, lanes))
-    rate(f"physics, {lanes:,} lanes", lanes * UNROLL_STEPS, steps, bodies, jax.block_until_ready)
+    @partial(jax.jit, compiler_options=_effort(1))
+    def steps(params: Any, thrusts: Any, bodies: Any) -> Any:
+        each = jax.vmap(lambda body, thrust: quadrotor.step(params, body, thrust, dt_s))
+
+        def block(of: Any) -> Any:
+            return jax.lax.scan(lambda b, thrust: (each(b, thrust), None), *of)[0]
+
+        return jax.lax.map(block, (bodies, thrusts))
+
+    draw = jax.vmap(jax.vmap(lambda k: quadrotor.draw(params.start, k)))
+    bodies = draw(jax.random.split(key, (blocks, lanes // blocks)))
+    about = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
+    thrusts = quadrotor.hover_thrust_N(params.physics) * about
+    step = partial(steps, jax.tree.map(jnp.asarray, params.physics), thrusts)
+    rate(f"physics, {lanes:,} lanes", lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
+
+
+@cache
+def on_its_way() -> Any:
+    """A hover run's learner, full ring and point, when it has just been filled."""
+    run = hover()
+    trainer, states, points = begun(run)
+    advance = laps.compile_advance(trainer, states, points)
+    states = advance(states, points, np.int32(run.learner.ring_unrolls))
+    return jax.tree.map(lambda x: jnp.array(x[0]), (states.learner, states.ring, points))
 
 
 def learning(minibatch_lanes: int, key: jax.Array) -> None:
     run = hover(minibatch_lanes=minibatch_lanes)
-    trainer, states, _ = begun(run)
-    config, learner = run.learner, trainer.learner
-    ring = jax.tree.map(lambda x: x[0], states.ring)._replace(inserted=jnp.int32(config.ring_unrolls))
-    updates, shards = 64, config.logical_shards
+    trainer = Trainer(request.environment(run.task), run.learner)
+    updates, shards = 64, run.learner.logical_shards
+    state, ring, here = on_its_way()
 
-    @jax.jit
-    def learn(carry: Any) -> Any:
+    @partial(jax.jit, compiler_options=_effort(1))
+    def learn(ring: Any, here: Any, carry: Any) -> Any:
         state, key = carry
         key, mine = jax.random.split(key)
-        index = buffer.draw(ring, jax.random.split(mine, shards), updates, minibatch_lanes // shards)
-        return jax.lax.scan(lambda s, i: (learner.update(s, buffer.gather(ring, i))[0], None), state, index)[0], key
+        keys = jax.random.split(mine, shards)
+        learner, env = trainer._under(here)
+        index = buffer.draw(ring, keys, updates, minibatch_lanes // shards)
+
+        def update(now: Any, drawn: Any) -> Any:
+            index, turns = drawn
+            return learner.update(now, trainer._turned(env, buffer.gather(ring, index), turns))
+
+        state, terms = jax.lax.scan(update, state, (index, trainer._turns(keys, index)))
+        return (state, key), terms
 
     samples = updates * minibatch_lanes * UNROLL_STEPS
-    first = jax.tree.map(lambda x: x[0], states.learner)
     rate(
         f"learning, {minibatch_lanes * UNROLL_STEPS:,} samples a minibatch",
         samples,
-        learn,
-        (first, key),
+        lambda carry: jax.block_until_ready(learn(ring, here, carry))[0],
+        (state, key),
         jax.block_until_ready,
     )
 
 
-def training(lanes: int, key: jax.Array) -> None:
+def training(unroll_steps: int, key: jax.Array) -> None:
     run = hover(
-        lanes=lanes,
+        lanes=TRAINING_LANES,
+        unroll_steps=unroll_steps,
         steps=10**9,
         ring_unrolls=1,
         warmup_unrolls=1,
         updates_per_unroll=BRAX_MINIBATCHES * BRAX_PASSES,
-        minibatch_lanes=lanes // BRAX_MINIBATCHES,
+        minibatch_lanes=TRAINING_LANES // BRAX_MINIBATCHES,
     )
     trainer, states, points = begun(run)
     advance = laps.compile_advance(trainer, states, points)
-    unrolls = 4
+    unrolls = 200 // unroll_steps
 
     def on(carry: Any) -> Any:
         states, done = carry
         return advance(states, points, np.int32(done + unrolls)), done + unrolls
 
-    rate("training loop", unrolls * run.learner.unroll_size, on, (states, 0), jax.block_until_ready)
+    rate(TRAINING[unroll_steps], unrolls * run.learner.unroll_size, on, (states, 0), jax.block_until_ready)
 
 
 def begun(run: runs.RunConfig) -> tuple[Trainer, Any, Any]:
@@ -134,8 +164,8 @@ def begun(run: runs.RunConfig) -> tuple[Trainer, Any, Any]:
 ROWS: dict[str, tuple[Callable[[int, jax.Array], None], tuple[int, ...]]] = {
     "acting": (acting, LANES),
     "physics": (physics, LANES),
-    "learning": (learning, (8, 64, 256)),
-    "training": (training, (TRAINING_LANES,)),
+    "learning": (learning, (8, 32, 256)),
+    "training": (training, tuple(TRAINING)),
 }
 
 

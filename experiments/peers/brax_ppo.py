@@ -1,8 +1,13 @@
-"""Brax's PPO on our own environments: `brax_ppo.py pendulum|hover --seed N [--steps N]`.
+"""Brax's PPO on our own environments: `brax_ppo.py pendulum|hover|circle --seed N [--steps N]`.
 
 Brax ships no settings for a torque-limited pendulum. Those of its `inverted_pendulum` notebook (reward scale 10, 2,048
 lanes, 2M steps) do not suit a CPU; PENDULUM has fewer lanes, a higher step size and a reward scaled to suit, found by
-hand. HOVER is the same with more lanes and a longer horizon, and no more tuned than that.
+hand. QUADROTOR is the same with more lanes and a longer horizon, and no more tuned than that. Circle's differs in the
+length of its episodes, which is that of qrl's preset.
+
+Brax restarts a lane from that lane's own first state, so that a run would see as many starts as it has lanes: here it
+draws all anew whenever an episode's time is up. And an end that is no termination is told to it as the truncation that
+it is (`Truncating`).
 """
 
 import argparse
@@ -35,7 +40,9 @@ PENDULUM: dict[str, Any] = {
     "reward_scaling": 0.1,
     "normalize_observations": True,
 }
-HOVER: dict[str, Any] = PENDULUM | {"num_envs": 256, "batch_size": 64, "unroll_length": 25, "discounting": 0.98}
+QUADROTOR: dict[str, Any] = PENDULUM | {"num_envs": 256, "batch_size": 64, "unroll_length": 25, "discounting": 0.98}
+EPISODE_STEPS = {"hover": 200, "circle": 600}
+EPISODES_A_CHECK = {"hover": 10, "circle": 3}
 NETWORKS: dict[str, Any] = {"policy_hidden_layer_sizes": (64, 64), "value_hidden_layer_sizes": (64, 64)}
 EVALUATION_STARTS_SEED = 1_000_003
 
@@ -54,6 +61,25 @@ def mend_jax() -> None:
         )
 
 
+class Truncating(envs.Wrapper):
+    """Tells Brax that episodes which our environments end out of bounds are truncated.
+
+    Brax knows of time limits alone. It would take such an end for a termination, worth 0 ever after; where rewards are
+    below 0, that pays a policy for fleeing. To stand outside its own wrappers, which set `truncation` at every step and
+    leave `info` alone when they reset.
+    """
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        state = self.env.step(state, action)
+        own = jnp.asarray(state.info.get("truncated", 0.0), jnp.float32)
+        return state.replace(info={**state.info, "truncation": jnp.maximum(state.info["truncation"], own)})
+
+
+def wrapped(env: Any, **how: Any) -> Truncating:
+    """As Brax wraps environments for training, and told of their own truncations."""
+    return Truncating(envs.training.wrap(env, **how))
+
+
 def pendulum_judged(policy: Policy) -> Act:
     """The deterministic policy as a function of observations in NumPy."""
     act, params = policy
@@ -70,8 +96,9 @@ def flights(env: Any) -> Callable[[Policy], dict[str, float]]:
 
 
 def learn(task: str, seed: int, steps: int, settings: dict[str, Any], judge: Judge, every: int) -> None:
-    """Train until the judge is content, a check after every `every` steps."""
+    """Train until the judge is content, a check after every `every` steps; at most `steps`, in whole checks."""
     env = envs.get_environment(task)
+    checks = max(1, steps // every)
 
     made: list[Any] = []  # the policy's function, which is the same at every check
 
@@ -88,11 +115,12 @@ def learn(task: str, seed: int, steps: int, settings: dict[str, Any], judge: Jud
     with contextlib.suppress(Solved):
         train.train(
             env,
-            num_timesteps=steps,
-            num_evals=steps // every + 1,
+            num_timesteps=checks * every,
+            num_evals=checks + 1,
             run_evals=False,
             seed=seed,
             policy_params_fn=handed,
+            wrap_env_fn=wrapped,
             network_factory=partial(networks.make_ppo_networks, **NETWORKS),
             **settings,
         )
@@ -100,7 +128,7 @@ def learn(task: str, seed: int, steps: int, settings: dict[str, Any], judge: Jud
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("task", choices=["pendulum", "hover"])
+    parser.add_argument("task", choices=["pendulum", "hover", "circle"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=float, default=1e6)
     args = parser.parse_args()
@@ -109,9 +137,10 @@ def main() -> None:
     if args.task == "pendulum":
         learn("pendulum", args.seed, steps, PENDULUM, pendulum_judge().hear_jax(), every=20_480)
     else:
-        env = envs.get_environment("hover")
-        judge = success_judge(flights(env)).hear_jax()
-        learn("hover", args.seed, steps, HOVER, judge, every=500_000)
+        steps_of, episodes = EPISODE_STEPS[args.task], EPISODES_A_CHECK[args.task]
+        settings = QUADROTOR | {"episode_length": steps_of, "num_resets_per_eval": episodes}
+        judge = success_judge(flights(envs.get_environment(args.task))).hear_jax()
+        learn(args.task, args.seed, steps, settings, judge, every=episodes * steps_of * QUADROTOR["num_envs"])
 
 
 if __name__ == "__main__":

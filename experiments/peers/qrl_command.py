@@ -1,8 +1,10 @@
 """The command as a user has it, defaults as they ship: `qrl_command.py TASK --seed N`.
 
 `qrl train TASK` in a process of its own, with an empty compile cache, then `qrl evaluate` from 1,000 fresh starts: the
-policy at the end is judged, not the first that was good enough. train_seconds are the run's own; total_seconds are
-those of the whole command, checkpoints, reports and pictures included; what is neither is `other_seconds`.
+policy at the end is judged, not the first that was good enough. So are the policies of the last 5 checkpoints, of which
+`worst_of_5_…` is the greatest steady-state error, and a quadrotor's off its nominal conditions. train_seconds are the
+run's own; total_seconds are those of the whole `qrl train`, checkpoints, reports and pictures included; what is neither
+is `other_seconds`.
 """
 
 import argparse
@@ -13,15 +15,29 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from judge import report
 
 TOLD = ("success", "settle_median_s", "settle_p95_s", "return_mean")
+CHECKPOINTS = 5
+QUADROTORS = ("hover", "circle")
+
+
+def told(found: dict[str, Any]) -> dict[str, float | None]:
+    """What is told of an evaluation.json; None: no finite number."""
+    steady = [name for name in found if name.startswith("rms_")]
+    of_each = {name: [one[name] for one in found["checkpoints"]] for name in steady}
+    return {
+        **{name: value for name, value in found.items() if name in TOLD or name in steady},
+        **{f"worst_of_{len(v)}_{name}": None if None in v else max(v) for name, v in of_each.items()},
+        **{f"off_nominal_success_{name}": one["success"] for name, one in found.get("off_nominal", {}).items()},
+    }
 
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("task", choices=["pendulum", "hover", "circle"])
+    parser.add_argument("task", choices=["pendulum", *QUADROTORS])
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -34,7 +50,8 @@ def main() -> None:
             return time.time() - begun
 
         seconds = qrl("train", args.task, "--seed", str(args.seed), "--out", str(out))
-        qrl("evaluate", str(out))
+        off = ["--off-nominal"] if args.task in QUADROTORS else []
+        qrl("evaluate", str(out), "--checkpoints", str(CHECKPOINTS), *off)
         last = json.loads((out / "summary.json").read_text())["result"]
         found = json.loads((out / "evaluation.json").read_text())
     report(
@@ -43,7 +60,7 @@ def main() -> None:
             "train_seconds": last["train_seconds"],
             "total_seconds": seconds,
             "other_seconds": seconds - last["train_seconds"],
-            **{name: value for name, value in found.items() if name in TOLD or name.startswith("rms_")},
+            **told(found),
         }
     )
 

@@ -10,6 +10,11 @@ LEAST_SECONDS = 0.5
 UNHEEDED = 3
 LANES = (256, 1024, 4096, 16_384)
 UNROLL_STEPS = 50
+# The training loop at Brax PPO's reuse, by qrl's unroll: with Brax's own, it makes as many optimiser steps too.
+TRAINING = {
+    50: "training loop, equal reuse; samples a minibatch: 32 × 50 of qrl, 32 × 10 of Brax",
+    10: "training loop, equal reuse and optimiser steps; samples a minibatch: 32 × 10 of both",
+}
 
 
 def rate(figure: str, per_call: int, call: Callable[[Any], Any], state: Any, ready: Callable[[Any], Any]) -> None:
