@@ -167,7 +167,7 @@ def test_wrong_config_is_one_clear_line(
     ("content", "says"),
     [
         ('{"seed": 3}', "key 'seed' is 0, found 3"),
-        ('{"learner": {"lam": 0.5}}', "key 'learner.lam' is 0.95, asked for 0.5"),
+        ('{"learner": {"lam": 0.5}}', "key 'learner.lam' is 1.0, asked for 0.5"),
     ],
 )
 def test_resume_with_another_config_is_refused(
