@@ -49,7 +49,8 @@ def fly(start: jax.Array, torque: jax.Array) -> tuple[jax.Array, ...]:
     params = env.Params(in_float64(pendulum.Physics, ROD), in_float64(rewards.SwingUp, REWARD), WORLD.params.start, {})
     x = pendulum.Pendulum(start[0], start[1])
     zero = jnp.float32(0.0)
-    state = State(env.Lane(x, params), pendulum.observe(x), jnp.float64(0.0), zero, {}, {"truncated": zero, "out_of_bounds": zero})
+    info = {"truncated": zero, "out_of_bounds": zero}
+    state = State(env.Lane(x, params), pendulum.observe(x), jnp.float64(0.0), zero, {}, info)
 
     def step(state: State, torque: jax.Array) -> tuple[State, State]:
         after = WORLD.step(state, torque[None] / ROD.max_torque_N_m)
