@@ -4,7 +4,6 @@ Brax's AutoResetWrapper restarts a lane from that lane's own first state and los
 here every episode gets a new draw, and the observation before reset is recorded.
 """
 
-import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -105,25 +104,6 @@ def unroll(
     more. The noise follows from `key`, which is this unroll's own; starts from `starts`, which is the key that `begin`
     had.
     """
-    count = lanes.number.shape[0]
-    one = functools.partial(_unroll, env, mean, sigma, key, starts, unroll_steps, longest)
-    block = max((size for size in range(1, BLOCK_LANES + 1) if count % size == 0), default=count)
-    if jax.default_backend() != "cpu" or count <= BLOCK_LANES or block < BLOCK_LANES // 8:
-        return one(lanes)
-    blocks = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), lanes)
-    return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), jax.lax.map(one, blocks))
-
-
-def _unroll(
-    env: Env,
-    mean: Callable[[chex.Array], chex.Array],
-    sigma: chex.Array,
-    key: chex.PRNGKey,
-    starts: chex.PRNGKey,
-    unroll_steps: int,
-    longest: int,
-    lanes: Lanes,
-) -> tuple[Lanes, Transition]:
     noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), (unroll_steps, env.action_size)))
 
     def step(lanes: Lanes, noise: chex.Array) -> tuple[Lanes, Transition]:
@@ -150,8 +130,21 @@ def _unroll(
         early = lanes.early + (done & (steps < longest))
         return lanes._replace(state=state, steps=steps, ended=ended, early=early), transition
 
-    lanes, transitions = jax.lax.scan(step, lanes, jnp.swapaxes(noise(lanes.number), 0, 1))
-    return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)
+    def steps_of(lanes: Lanes) -> tuple[Lanes, Transition]:
+        lanes, transitions = jax.lax.scan(step, lanes, jnp.swapaxes(noise(lanes.number), 0, 1))
+        return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)
+
+    return _in_blocks(steps_of, lanes)
+
+
+def _in_blocks(steps_of: Callable[[Lanes], tuple[Lanes, Transition]], lanes: Lanes) -> tuple[Lanes, Transition]:
+    """`steps_of` all lanes, on a CPU in blocks of at most BLOCK_LANES where their number divides so."""
+    count = lanes.number.shape[0]
+    block = max(size for size in range(1, BLOCK_LANES + 1) if count % size == 0)
+    if jax.default_backend() != "cpu" or count <= BLOCK_LANES or block < BLOCK_LANES // 8:
+        return steps_of(lanes)
+    blocks = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), lanes)
+    return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), jax.lax.map(steps_of, blocks))
 
 
 def _said(state: State, name: str) -> chex.Array:
