@@ -20,7 +20,8 @@ from jax.flatten_util import ravel_pytree
 
 from qrl import buffer, laps, request, rollout, runs
 from qrl.learner import Learner
-from qrl.train import Trainer, TrainState, _effort, point, stack
+from qrl.state import TrainState, point, stack
+from qrl.train import Trainer, _effort
 from qrl.types import Networks, Transition
 from qrl.vtrace import vtrace
 

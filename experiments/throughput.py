@@ -24,7 +24,8 @@ import numpy as np
 
 from qrl import buffer, laps, request, rollout, runs
 from qrl.learner import Learner
-from qrl.train import Trainer, _effort, point, spread, stack
+from qrl.state import point, spread, stack
+from qrl.train import Trainer, _effort
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from rates import LANES, TRAINING, UNROLL_STEPS, rate

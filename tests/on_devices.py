@@ -12,7 +12,8 @@ import numpy as np
 
 from qrl import laps, runs
 from qrl.config import Config
-from qrl.train import Trainer, point, spread, stack
+from qrl.state import point, spread, stack
+from qrl.train import Trainer
 from qrl_envs import env as worlds
 
 LITTLE = {

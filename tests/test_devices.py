@@ -9,9 +9,9 @@ import jax
 import numpy as np
 import pytest
 
-from qrl import train
 from qrl.config import Config
 from qrl.runs import preset
+from qrl.state import spread
 
 TOLERANCE = 1e-5  # of everything after ten updates, absolute and relative
 FLIGHT_TOLERANCE = 1e-2  # of flights, in which a difference grows for 200 steps
@@ -83,7 +83,7 @@ def test_what_one_device_saved_goes_on_over_several(trained: dict[str, Values], 
 )
 def test_devices_are_shared_evenly(devices: int, members: int, shards: int, shape: tuple[int, int] | None) -> None:
     """As many as members, and then shards, can be dealt out to in equal parts."""
-    mesh = train.spread(jax.devices() * devices, members, shards)
+    mesh = spread(jax.devices() * devices, members, shards)
     assert (tuple(mesh.shape.values()) if mesh else None) == shape
 
 

@@ -21,7 +21,8 @@ from frontdoor import qrl
 from qrl import checkpoint, laps, processes, restore
 from qrl.checkpoint import Checkpoint
 from qrl.seal import FORMAT, NAME, Damaged, Foreign, Record
-from qrl.train import Trainer, TrainState, point, stack
+from qrl.state import TrainState, point, stack
+from qrl.train import Trainer
 from qrl_envs import env as worlds
 from test_loop import run_config, train
 

@@ -20,8 +20,8 @@ from hypothesis import strategies as st
 from qrl import grid, plots, request, runs, sweep, sweep_command
 from qrl.config import Config
 from qrl.runs import RunConfig, TaskRecord
+from qrl.state import point
 from qrl.terminal import clock
-from qrl.train import point
 from qrl_envs import ports, specfile
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput

@@ -12,7 +12,8 @@ from brax.envs.base import Env, State
 from qrl import checkpoint, laps, loop, restore, runs
 from qrl.config import Config
 from qrl.runs import RunConfig, TaskRecord
-from qrl.train import Trainer, point, stack
+from qrl.state import point, stack
+from qrl.train import Trainer
 from qrl_envs import env as worlds
 
 SMALL = {

@@ -19,8 +19,9 @@ import pytest
 from frontdoor import complaint, qrl
 from qrl import laps, processes, results, sweep, sweep_command, sweep_plot, train
 from qrl.grid import load
+from qrl.state import TrainState, point, stack
 from qrl.sweep import Group, Member, Result
-from qrl.train import Trainer, point, stack
+from qrl.train import Trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 
@@ -350,7 +351,7 @@ def test_vmapped_members_agree_with_members_in_turn(tmp_path: Path, monkeypatch:
     config = grid.points[0].learner
     points = stack([point(worlds.from_task(_task(p)), p.learner) for p in grid.points])
 
-    def last(in_turn: bool) -> train.TrainState:
+    def last(in_turn: bool) -> TrainState:
         monkeypatch.setattr(train, "_in_turn", lambda _: in_turn)
         trainer = Trainer(worlds.make("pendulum"), config)
         return trainer.advance(trainer.init(laps.seeds(0, 4), points), points, np.int32(config.unrolls))

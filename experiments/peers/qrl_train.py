@@ -16,7 +16,8 @@ import qrl_envs  # noqa: F401 - registers our environments with Brax
 from judge import Act, Judge, pendulum_judge, success_judge
 from qrl import laps, request, runs
 from qrl.evaluate import summarise
-from qrl.train import Trainer, point, stack
+from qrl.state import point, stack
+from qrl.train import Trainer
 
 STARTS, EVALUATION_STARTS_SEED = 1000, 1_000_003  # those of `qrl evaluate`
 

@@ -26,7 +26,7 @@ from qrl.export.quantise import Inexpressible, quantise, si_layers
 from qrl.export.report import Flown, Measured, report
 from qrl.learner import MAX_NORMALISED
 from qrl.policy import Acted, Observed, Origin, Policy
-from qrl.train import point, stack
+from qrl.state import point, stack
 from qrl_envs import ports
 from qrl_envs.specfile import BadInput
 

@@ -14,8 +14,9 @@ from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE
 from qrl.learner import LearnerState
 from qrl.runs import RunConfig
+from qrl.state import point, stack
 from qrl.terminal import console
-from qrl.train import Trainer, point, stack
+from qrl.train import Trainer
 from qrl_envs import picture
 from qrl_envs.conditions import Condition, OffNominal, conditions
 from qrl_envs.specfile import BadInput

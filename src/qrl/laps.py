@@ -14,7 +14,8 @@ from qrl.config import Config
 from qrl.evaluate import Flights, summarise
 from qrl.learner import LearnerState
 from qrl.runs import Row
-from qrl.train import FAULT_TERMS, Point, Totals, Trainer, TrainState
+from qrl.state import FAULT_TERMS, Point, Totals, TrainState
+from qrl.train import Trainer
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # how long the device works between two signs of life

@@ -16,8 +16,9 @@ from qrl.evaluate import Flights
 from qrl.laps import Clock, Lap, NotFinite, Programs, compile_advance, compile_fly, laps, report_starts, seeds
 from qrl.runs import Row, RunConfig
 from qrl.seal import Record
+from qrl.state import point, spread, stack
 from qrl.tensorboard import EventLog
-from qrl.train import Trainer, point, spread, stack
+from qrl.train import Trainer
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
 

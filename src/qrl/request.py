@@ -11,7 +11,7 @@ from brax.envs.base import Env
 from qrl import runs
 from qrl.config import Config
 from qrl.runs import ConfigFile, RunConfig, TaskRecord
-from qrl.train import spread
+from qrl.state import spread
 from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as tasks

@@ -10,7 +10,8 @@ from brax.envs.base import Env
 from qrl import checkpoint, laps
 from qrl.runs import RunConfig
 from qrl.seal import Damaged, Record
-from qrl.train import Point, Trainer, TrainState, point, stack
+from qrl.state import Point, TrainState, point, stack
+from qrl.train import Trainer
 
 
 class Restored(NamedTuple):

@@ -23,7 +23,8 @@ from jax.sharding import SingleDeviceSharding
 
 from qrl import laps
 from qrl.runs import Row, replace_text
-from qrl.train import Point, Trainer, stack
+from qrl.state import Point, stack
+from qrl.train import Trainer
 
 # A CPU takes the members of a chunk one after the other: more gain no speed, and are what an interruption loses.
 CPU_CHUNK = 8

@@ -17,9 +17,10 @@ from qrl import sweep as members_of
 from qrl.exits import DONE, FAILED, complain
 from qrl.grid import Grid
 from qrl.processes import Process
+from qrl.state import point
 from qrl.sweep import ChunkDone, Compiling, Group, Member
 from qrl.terminal import clock, console, stop_requested
-from qrl.train import Trainer, point
+from qrl.train import Trainer
 from qrl_envs.specfile import BadInput, read
 
 SHOWN = 20  # points in the table on the terminal
