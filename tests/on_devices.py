@@ -28,8 +28,12 @@ LITTLE = {
     "critic_hidden": [16],
     "normalise_observations": True,
     "report_flights": 5,
+    "apg_fraction": 0.5,
+    "apg_lanes": 16,
+    "apg_steps": 20,
 }
 TEN_UPDATES = 3  # unrolls
+CLIMBS = 3
 
 
 def named(tree: Any) -> dict[str, np.ndarray]:
@@ -50,6 +54,10 @@ def main(folder: Path) -> None:
             saved = saved or trainer.member(states, 0)  # from one device, as a checkpoint has it
             further = trainer.advance(trainer.place(stack([saved])), points, np.int32(TEN_UPDATES + 1))
             np.savez(folder / f"further-{count}.npz", **named(trainer.on_host(further)))
+            learnt = trainer.place(stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))
+            until = config.learning_unrolls + CLIMBS * config.unrolls_per_climb
+            climbed = trainer.climb(learnt, points, np.int32(until))
+            np.savez(folder / f"climbed-{count}.npz", **named(trainer.on_host(climbed)))
 
 
 if __name__ == "__main__":

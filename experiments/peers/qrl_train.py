@@ -47,6 +47,8 @@ def main() -> None:
     args = parser.parse_args()
     trainer, points, run = contestant(args.task, args.preset, args.seed)
     config = run.learner
+    if config.climbs:
+        parser.error("expected a preset that learns to its end: apg_fraction 0")
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
 
     def flights(learners: Any) -> dict[str, float]:

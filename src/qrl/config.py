@@ -74,6 +74,14 @@ class Config(BaseModel):
         description="last part of the run over which the policy that ships is averaged; 0: not averaged"
     )
 
+    apg_fraction: Static[Fraction] = Field(
+        description="last part of the run's steps, in which the policy climbs the gradient of whole flights through the"
+        " environment itself (analytic policy gradient); 0: none"
+    )
+    apg_lanes: Static[Count] = Field(description="flights of one such update")
+    apg_steps: Static[Count] = Field(description="steps of such a flight")
+    apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; linear to 0")
+
     gamma: Traced[Fraction] = Field(description="discount")
     lam: Traced[Fraction] = Field(description="lambda of the trace; 1 in the paper")
     rho_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the temporal difference; 1 in the paper")
@@ -93,14 +101,15 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
-        if self.warmup_unrolls > self.unrolls:
+        if self.warmup_unrolls > self.learning_unrolls:
+            least, found = (n * self.unroll_size for n in (self.warmup_unrolls, self.learning_unrolls))
+            before = " before the analytic gradient" if self.climbs else ""
             raise ValueError(
-                f"expected steps of at least warmup_unrolls · lanes · unroll_steps"
-                f" = {self.warmup_unrolls * self.unroll_size:,}, found {self.steps:,}"
+                f"expected steps of at least warmup_unrolls · lanes · unroll_steps = {least:,}{before}, found {found:,}"
             )
-        for name in ("lanes", "minibatch_lanes"):
+        for name in ("lanes", "minibatch_lanes", *(["apg_lanes"] if self.climbs else [])):
             if (value := getattr(self, name)) % self.logical_shards:
-                raise ValueError(f"expected {name} to be a multiple of shards = {self.shards}, found {value}")
+                raise ValueError(f"expected {name} to be a multiple of shards = {self.logical_shards}, found {value}")
         return self
 
     @property
@@ -127,6 +136,21 @@ class Config(BaseModel):
     def unrolls(self) -> int:
         """Unrolls in the whole run; never more steps than `steps`."""
         return self.steps // self.unroll_size
+
+    @property
+    def unrolls_per_climb(self) -> int:
+        """What the flights of one update by the analytic gradient take of the run's steps."""
+        return -(-self.apg_lanes * self.apg_steps // self.unroll_size)
+
+    @property
+    def climbs(self) -> int:
+        """Updates by the analytic gradient, at the run's end."""
+        return int(self.unrolls * self.apg_fraction) // self.unrolls_per_climb
+
+    @property
+    def learning_unrolls(self) -> int:
+        """Unrolls that are made and learnt from; the rest of the run's steps are the climbs'."""
+        return self.unrolls - self.climbs * self.unrolls_per_climb
 
     @property
     def unrolls_per_report(self) -> int:

@@ -45,17 +45,26 @@ class Lap:
     faults: list[str]  # of each member, what was first not finite in its training, and when; "": nothing
 
 
+Advance = Callable[[TrainState, Point, np.int32], TrainState]
+
+
 @dataclass(frozen=True)
 class Programs:
     """A trainer's programs, compiled for a number of members."""
 
-    advance: Callable[[TrainState, Point, np.int32], TrainState]
+    advance: Advance
+    climb: Callable[[], Advance]  # asked for when it is needed, so that it may still be compiling before
     fly: Callable[[LearnerState, Point, jax.Array], Flights]
     on_host: Callable[[Any], Any]
 
 
 def compile_advance(trainer: Trainer, states: TrainState, points: Point) -> Any:
     return trainer.advance.lower(states, points, np.int32(0)).compile()
+
+
+def compile_climb(trainer: Trainer, states: TrainState, points: Point) -> Any:
+    """Of the run's last part; None where it has none."""
+    return trainer.climb.lower(states, points, np.int32(0)).compile() if trainer.config.climbs else None
 
 
 def compile_fly(trainer: Trainer, states: TrainState, points: Point) -> Any:
@@ -90,9 +99,11 @@ def laps(
     chunk = 1
     while done < config.unrolls and not hear(stopped()).any():
         report_at = min(config.unrolls, (done // config.unrolls_per_report + 1) * config.unrolls_per_report)
-        until = min(report_at, done + chunk)
+        learning = done < config.learning_unrolls
+        until = min(report_at, done + chunk, config.learning_unrolls if learning else config.unrolls)
+        advance = programs.advance if learning else programs.climb()
         started = time.perf_counter()
-        states = jax.block_until_ready(programs.advance(states, points, np.int32(until)))
+        states = jax.block_until_ready(advance(states, points, np.int32(until)))
         lap = float(hear(time.perf_counter() - started)[peers.FIRST])
         clock = Clock(clock.train_seconds + lap, clock.report_seconds + lap)
         chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))

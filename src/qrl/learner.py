@@ -64,7 +64,7 @@ class Learner:
         self.observation_size = observation_size
         self.policy = MLP(config.policy_hidden, action_size, config.activation, final_gain=0.01)
         self.critic = MLP(config.critic_hidden, 1, config.activation, final_gain=1.0)
-        self.total_updates = max(1, (config.unrolls - config.warmup_unrolls + 1) * config.updates_per_unroll)
+        self.total_updates = max(1, (config.learning_unrolls - config.warmup_unrolls + 1) * config.updates_per_unroll)
         self._set(hyper(config))
 
     def under(self, hyper: Hyper) -> "Learner":
@@ -91,8 +91,8 @@ class Learner:
         )
 
     def progress(self, state: LearnerState) -> chex.Array:
-        """Fraction of the run's updates already made."""
-        return state.updates / self.total_updates
+        """Fraction of the run's updates on minibatches already made; those by the analytic gradient follow at 1."""
+        return jnp.minimum(state.updates / self.total_updates, 1.0)
 
     def sigma(self, state: LearnerState) -> chex.Array:
         """The policy's standard deviation, log-linear in the run's progress; []."""
@@ -133,18 +133,53 @@ class Learner:
         start, end = self.hyper["learning_rate"], self.hyper["learning_rate_end"]
         rate = start + self.progress(state) * (end - start)
 
-        def ascend(params: chex.ArrayTree, gradient: chex.ArrayTree, opt: chex.ArrayTree) -> tuple[Any, ...]:
-            flat, whole = ravel_pytree(gradient)
-            direction, opt = self._optimiser.update(flat, opt)
-            moved = jax.tree.map(lambda p, d: p - rate * d, params, whole(jnp.asarray(direction)))
-            return moved, opt, optax.tree.norm(flat)
-
-        policy, policy_opt, policy_norm = ascend(state.params.policy, gradient.policy, state.optimiser.policy)
-        critic, critic_opt, critic_norm = ascend(state.params.critic, gradient.critic, state.optimiser.critic)
+        policy, policy_opt, policy_norm = self._moved(
+            state.params.policy, gradient.policy, state.optimiser.policy, rate
+        )
+        critic, critic_opt, critic_norm = self._moved(
+            state.params.critic, gradient.critic, state.optimiser.critic, rate
+        )
         state = state._replace(
             params=Networks(policy, critic), optimiser=Networks(policy_opt, critic_opt), updates=state.updates + 1
         )
         return self._averaged(state), terms._replace(policy_gradient=policy_norm, value_gradient=critic_norm)
+
+    def climb(
+        self, state: LearnerState, returns: Callable[[LearnerState], chex.Array], made: chex.Array
+    ) -> tuple[LearnerState, Terms]:
+        """One step of the policy up the mean of `returns` [n], differentiable in the learner's policy.
+
+        `made`: int32 [], how many such steps were made before. The first begins with the policy that ships and an
+        optimiser that has seen nothing. A gradient that is not finite is not followed: flights can be chaotic.
+        """
+        first, ships = made == 0, self.shipped(state).params.policy
+        optimiser = jax.tree.map(lambda x: jnp.where(first, 0, x).astype(x.dtype), state.optimiser.policy)
+
+        def loss(policy: chex.ArrayTree) -> chex.Array:
+            return -jnp.mean(returns(state._replace(params=state.params._replace(policy=policy))))
+
+        worth, gradient = self._over_devices(jax.value_and_grad(loss)(ships))
+        finite = jnp.isfinite(optax.tree.norm(gradient))
+        gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
+        rate = self.hyper["apg_learning_rate"] * (1.0 - made / max(1, self.config.climbs))
+        policy, optimiser, norm = self._moved(ships, gradient, optimiser, rate)
+        zero = jnp.zeros(())
+        state = state._replace(
+            params=state.params._replace(policy=policy),
+            optimiser=state.optimiser._replace(policy=optimiser),
+            average=policy,
+            updates=state.updates + 1,
+        )
+        return state, Terms(*[zero] * len(Terms._fields))._replace(policy_loss=worth, policy_gradient=norm)
+
+    def _moved(
+        self, params: chex.ArrayTree, gradient: chex.ArrayTree, optimiser: chex.ArrayTree, rate: chex.Array
+    ) -> tuple[Any, Any, chex.Array]:
+        """A network's parameters and optimiser a step on, and the norm of the gradient."""
+        flat, whole = ravel_pytree(gradient)
+        direction, optimiser = self._optimiser.update(flat, optimiser)
+        moved = jax.tree.map(lambda p, d: p - rate * d, params, whole(jnp.asarray(direction)))
+        return moved, optimiser, optax.tree.norm(flat)
 
     def _loss(self, params: Networks, state: LearnerState, batch: Transition) -> tuple[chex.Array, Terms]:
         config, hyper = self.config, self.hyper

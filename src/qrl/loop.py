@@ -13,7 +13,18 @@ from brax.envs.base import Env
 from qrl import checkpoint, peers, restore, runs
 from qrl.checkpoint import Checkpoint
 from qrl.evaluate import Flights
-from qrl.laps import Clock, Lap, NotFinite, Programs, compile_advance, compile_fly, laps, report_starts, seeds
+from qrl.laps import (
+    Clock,
+    Lap,
+    NotFinite,
+    Programs,
+    compile_advance,
+    compile_climb,
+    compile_fly,
+    laps,
+    report_starts,
+    seeds,
+)
 from qrl.runs import Row, RunConfig
 from qrl.seal import Record
 from qrl.state import point, spread, stack
@@ -108,7 +119,8 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
     states: Any = None
     members: list[Member] = []
     # Side by side: each takes XLA seconds, and has little use for a second core.
-    with ThreadPoolExecutor() as aside:
+    aside = ThreadPoolExecutor()
+    try:
         yield Compiling()
         advance = aside.submit(compile_advance, trainer, trainer.laid_out(like), points)
         fly = aside.submit(compile_fly, trainer, trainer.laid_out(like), points)
@@ -125,8 +137,12 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
             yield GoingOn(begin, found.notes)
         if not begin:
             states = trainer.init(seeds(run.seed, run.seeds), points)
-        programs = Programs(advance.result(), fly.result(), trainer.on_host)
-    try:
+        programs = Programs(
+            advance=advance.result(),
+            fly=fly.result(),
+            climb=aside.submit(compile_climb, trainer, trainer.laid_out(like), points).result,  # while training goes on
+            on_host=trainer.on_host,
+        )
         members = [Member(folder, configs[i], begin, rows[i]) for i, folder in enumerate(folders)]
         yield Compiled()
         saver = _Saver(trainer, run, members, clock)
@@ -138,6 +154,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
             flights = programs.on_host(programs.fly(states.learner, points, report_starts(run.learner)))
             yield Finished(flights, [member.rows for member in members])
     finally:
+        aside.shutdown(cancel_futures=True)
         for member in members:
             member.close()
 

@@ -184,8 +184,10 @@ def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
         jax.eval_shape(trainer.init, seeds, points),
     )
-    advance, fly = laps.compile_advance(trainer, states, points), laps.compile_fly(trainer, states, points)
-    return trainer.init.lower(seeds, points).compile(), laps.Programs(advance, fly, trainer.on_host)
+    advance, climb, fly = (
+        compiled(trainer, states, points) for compiled in (laps.compile_advance, laps.compile_climb, laps.compile_fly)
+    )
+    return trainer.init.lower(seeds, points).compile(), laps.Programs(advance, lambda: climb, fly, trainer.on_host)
 
 
 def _chunk(

@@ -19,7 +19,7 @@ from brax.envs.base import Env
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from qrl import buffer, evaluate, rollout
+from qrl import apg, buffer, evaluate, rollout
 from qrl.buffer import Ring
 from qrl.config import Config
 from qrl.learner import Learner, LearnerState, Terms
@@ -32,7 +32,8 @@ class Trainer:
     """The compiled programs of one environment and configuration, for any values of what a `Point` holds.
 
     init     (seeds [M], points [M])          -> states [M]
-    advance  (states [M], points [M], until)  -> states [M]; donates the states
+    advance  (states [M], points [M], until)  -> states [M]; donates the states; `until` config.learning_unrolls
+    climb    (states [M], points [M], until)  -> states [M]; donates the states; from there on
     fly      (learners [M], points [M], keys) -> Flights [M]
 
     On one device, or over those of a `mesh` (`state.spread`), whose member axis divides M.
@@ -46,9 +47,13 @@ class Trainer:
         sizes = int(env.observation_size), env.action_size  # pyright: ignore[reportArgumentType]
         self.learner = Learner(config, *sizes, SHARD if mesh else None)
         init = self._over_mesh(self._init_all, (P(MEMBER), P(MEMBER)), LAYOUT)
-        advance = self._over_mesh(self._advance_all, (LAYOUT, P(MEMBER), P()), LAYOUT)
+        advance, climb = (
+            self._over_mesh(functools.partial(self._go_on_all, one), (LAYOUT, P(MEMBER), P()), LAYOUT)
+            for one in (self._advance, self._climb)
+        )
         self.init = jax.jit(init, compiler_options=xla_effort(0))  # it runs once
         self.advance = jax.jit(advance, donate_argnums=0, compiler_options=xla_effort(1))
+        self.climb = jax.jit(climb, donate_argnums=0, compiler_options=xla_effort(1))
         self.fly = jax.jit(self._fly_evenly, compiler_options=xla_effort(1))
         everywhere = NamedSharding(mesh, P()) if mesh else None
         self._everywhere = jax.jit(lambda tree: tree, out_shardings=everywhere)
@@ -107,16 +112,22 @@ class Trainer:
     def _init_all(self, seeds: chex.Array, points: Point) -> TrainState:
         return _over_members(lambda m: self._init(m[0], m[1]), (seeds, points))
 
-    def _advance_all(self, states: TrainState, points: Point, until: chex.Array) -> TrainState:
+    def _go_on_all(
+        self,
+        one: Callable[[TrainState, Point, chex.Array], TrainState],
+        states: TrainState,
+        points: Point,
+        until: chex.Array,
+    ) -> TrainState:
         if _in_turn(len(states.unrolls)):
-            return _over_members(lambda m: self._advance(m[0], m[1], until), (states, points))
+            return _over_members(lambda m: one(m[0], m[1], until), (states, points))
         # All members are equally far, and their counters stay without a member axis: batched, they would turn every
         # insert into the ring into a scatter, and the loop into a selection over the whole state.
         axes: Any = TrainState(*[0] * len(TrainState._fields))._replace(ring=Ring(0, None), unrolls=None)  # pyright: ignore[reportArgumentType]
         members = states._replace(
             unrolls=states.unrolls[0], ring=states.ring._replace(inserted=states.ring.inserted[0])
         )
-        after = jax.vmap(self._advance, in_axes=(axes, 0, None), out_axes=axes)(members, points, until)
+        after = jax.vmap(one, in_axes=(axes, 0, None), out_axes=axes)(members, points, until)
         count = states.unrolls.shape
         ring = after.ring._replace(inserted=jnp.broadcast_to(after.ring.inserted, count))
         return after._replace(unrolls=jnp.broadcast_to(after.unrolls, count), ring=ring)
@@ -168,6 +179,36 @@ class Trainer:
         learner, env = self._under(point)
         step = functools.partial(self._unroll_and_learn, learner, env)
         return jax.lax.fori_loop(state.unrolls, until, lambda _, state: step(state), state)
+
+    def _climb(self, state: TrainState, point: Point, until: chex.Array) -> TrainState:
+        """Go on until `until` unrolls by the analytic gradient; an update stands for as many as its flights take."""
+        config, (learner, env) = self.config, self._under(point)
+        lanes = self._share(config.apg_lanes)
+
+        def climbed(unrolls: chex.Array) -> chex.Array:
+            return (unrolls - config.learning_unrolls) // config.unrolls_per_climb
+
+        def climb(i: chex.Array, state: TrainState) -> TrainState:
+            key = jax.random.fold_in(state.key, config.learning_unrolls + i)
+            keys = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(lanes)
+
+            def returns(now: LearnerState) -> chex.Array:
+                return apg.returns(env, lambda o: learner.mean(now, o), learner.sigma(now), keys, config.apg_steps)
+
+            now, terms = learner.climb(state.learner, returns, i)
+            flown = config.apg_lanes * config.apg_steps
+            seen = Totals(
+                rewards=-terms.policy_loss * config.apg_lanes,
+                steps=jnp.float32(flown),
+                episodes=jnp.float32(config.apg_lanes),
+                early=jnp.float32(0.0),
+                updates=jnp.float32(1.0),
+                terms=terms,
+            )
+            return state._replace(learner=now, totals=jax.tree.map(jnp.add, state.totals, seen))
+
+        state = jax.lax.fori_loop(climbed(state.unrolls), climbed(until), climb, state)
+        return state._replace(unrolls=until)
 
     def _turns(self, keys: chex.PRNGKey, index: chex.Array) -> chex.Array:
         """What draws a symmetry for each trajectory at `index` [minibatches, S·each]; [minibatches, S·each, 2]."""
