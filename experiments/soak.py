@@ -31,7 +31,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("experiments/out/soak"))
     args = parser.parse_args()
     reports = max(4, round(args.steps / REPORT_STEPS))
-    run = request.run_config("hover", None, runs.ConfigFile(), {"steps": args.steps, "reports": reports}, 0, 1)
+    run = request.run_config("hover", None, runs.ConfigFile(), {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}, 0, 1)
     if args.out.exists():
         print(f"{args.out}: exists already; give another --out", file=sys.stderr)
         return 2

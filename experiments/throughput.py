@@ -36,7 +36,7 @@ TRAINING_LANES = 512
 
 def hover(**learner: Any) -> runs.RunConfig:
     """Hover with the default networks and these hyperparameters."""
-    file = runs.ConfigFile(learner=runs.preset("hover") | {"unroll_steps": UNROLL_STEPS} | learner)
+    file = runs.ConfigFile(learner=runs.preset("hover") | {"unroll_steps": UNROLL_STEPS, "apg_fraction": 0.0} | learner)
     return request.run_config("hover", None, file, {}, 0, 1)
 
 

@@ -152,6 +152,12 @@ class Config(BaseModel):
         """Unrolls that are made and learnt from; the rest of the run's steps are the climbs'."""
         return self.unrolls - self.climbs * self.unrolls_per_climb
 
+    def work(self, first: int, last: int) -> float:
+        """What there is to do from `first` to `last` unrolls, in steps flown or learnt from: for the time that is left."""
+        replayed = self.updates_per_unroll * self.minibatch_lanes / self.lanes
+        learning = min(last, self.learning_unrolls) - min(first, self.learning_unrolls)
+        return self.unroll_size * ((last - first) + replayed * learning)
+
     @property
     def unrolls_per_report(self) -> int:
         return max(1, -(-self.unrolls // self.reports))

@@ -109,7 +109,7 @@ def laps(
         chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))
         speed = (until - done) * config.unroll_size * count / lap
         done = until
-        left = (time.perf_counter() - began) / (done - first) * (config.unrolls - done)
+        left = (time.perf_counter() - began) * config.work(done, config.unrolls) / config.work(first, done)
         faults = _faults(programs.on_host((states.fault_update, states.fault_term)))
         rows: list[Row] = []
         if done == report_at:
