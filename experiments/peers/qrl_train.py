@@ -47,8 +47,6 @@ def main() -> None:
     args = parser.parse_args()
     trainer, points, run = contestant(args.task, args.preset, args.seed)
     config = run.learner
-    if config.climbs:
-        parser.error("expected a preset that learns to its end: apg_fraction 0")
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
 
     def flights(learners: Any) -> dict[str, float]:
@@ -58,10 +56,11 @@ def main() -> None:
     judged = pendulum_judged(trainer)
     judge.hear_jax().start()
     states = trainer.init(laps.seeds(run.seed, 1), points)
-    advance = laps.compile_advance(trainer, states, points)
+    advance, climb = laps.compile_advance(trainer, states, points), laps.compile_climb(trainer, states, points)
     pieces = min(args.checks, config.unrolls)
-    for until in (round(config.unrolls * (i + 1) / pieces) for i in range(pieces)):
-        states = jax.block_until_ready(advance(states, points, np.int32(until)))
+    for until in sorted({round(config.unrolls * (i + 1) / pieces) for i in range(pieces)} | {config.learning_unrolls}):
+        on = advance if until <= config.learning_unrolls else climb
+        states = jax.block_until_ready(on(states, points, np.int32(until)))
         learners = states.learner
         policy = judged(jax.tree.map(lambda x: x[0], learners)) if args.task == "pendulum" else learners
         if judge.check(until * config.unroll_size, policy):
