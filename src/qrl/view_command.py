@@ -40,7 +40,7 @@ def view(args: argparse.Namespace) -> int:
         member, starts = config.member(i), asked or _varied(folder)
         env_steps, flights = _flown(trainer, member, folder, starts)
         title = f"{member.task.name}, seed {member.seed}, step {env_steps:,}"
-        page = viewer.page(task, title, Flown(starts, flights.observations, flights.actions))
+        page = viewer.page(task, title, Flown(starts, np.asarray(flights.observations), np.asarray(flights.actions)))
         path = args.out or folder / "view.html"
         runs.replace_text(path, page)
         console.print(f"{path}: {len(starts)} flights, {len(page.encode()) / 1e6:.1f} MB; open it in a browser")

@@ -95,8 +95,8 @@ def _data(task: Task, title: str, flown: Flown) -> dict[str, Any]:
             "up": _plain(observations[:, ::stride, [2, 5, 8]].swapaxes(1, 2), 1e-4),
         }
     columns = [[_plain(line.values[:, ::stride], panel.resolution) for line in panel.lines] for panel in panels]
-    finite = np.isfinite(observations).all(axis=2)
-    lengths = np.where(finite.all(axis=1), samples, finite.argmin(axis=1))  # up to the first that is not
+    finite = np.all(np.isfinite(observations), axis=2)
+    lengths = np.where(np.all(finite, axis=1), samples, np.argmin(finite, axis=1))  # up to the first that is not
     ends_s = np.where(lengths < samples, lengths * task.control_period_s, np.inf)
     return {
         "title": title,
@@ -125,7 +125,9 @@ def _plain(values: np.ndarray, resolution: float) -> list[Any]:
     """Nested lists of `values`, rounded to the decimals that `resolution` needs; None for what is not finite."""
     decimals = max(0, int(np.ceil(-np.log10(resolution) - 1e-9)))
     rounded = np.round(np.asarray(values, float), decimals) + 0.0  # no −0
-    return np.where(np.isfinite(rounded), rounded.astype(object), None).tolist()
+    plain = rounded.astype(object)
+    plain[~np.isfinite(rounded)] = None
+    return plain.tolist()
 
 
 def _described(panel: Panel) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 // World and body: x forward, y left, z up [m].
 
 const MAGNIFICATIONS = [1, 2, 3, 5, 10, 20, 30, 50, 100, 200, 300, 500, 1000];
-const VISIBLE = 0.2; // of the scene: what the vehicle spans at least
+const VISIBLE = 0.28; // of the scene: what the vehicle spans at least
 const BAR = 1.7; // length of a thrust bar at full thrust, in arm lengths
 
 // Triangles of one colour each. A vertex with a motor in `lifted` moves up by that motor's thrust.
@@ -96,7 +96,7 @@ function vehicleScene(div, page, onCamera) {
     });
     const longest = Math.max(...spans.map(([a, b]) => b - a));
     magnified = MAGNIFICATIONS.find(m => m * shape.span >= VISIBLE * longest) ?? MAGNIFICATIONS.at(-1);
-    const margin = 0.6 * magnified * shape.span, least = 0.5 * longest;
+    const margin = 0.5 * magnified * shape.span, least = 0.5 * longest;
     return spans.map(([a, b]) => {
       const more = margin + Math.max(0, least - (b - a)) / 2;
       return [a - more, b + more];
@@ -160,7 +160,7 @@ function vehicleScene(div, page, onCamera) {
       font: { family: "system-ui, 'DejaVu Sans', sans-serif" },
       scene: {
         xaxis: axis("x", 0), yaxis: axis("y", 1), zaxis: axis("z", 2), aspectmode: "manual", aspectratio: { x, y, z },
-        camera: overview ?? { eye: { x: 1.08, y: -1.58, z: 0.62 }, center: { x: -0.05, y: -0.04, z: -0.13 }, up: { x: 0, y: 0, z: 1 } },
+        camera: overview ?? { eye: { x: 1.05, y: -1.53, z: 0.85 }, center: { x: -0.05, y: -0.04, z: -0.13 }, up: { x: 0, y: 0, z: 1 } },
         dragmode: "turntable",
       },
     };

@@ -75,6 +75,7 @@ function remember() {
 }
 
 async function choose(start, time) {
+  play(false);
   state.flight = page.flights.find(flight => flight.start === start) ?? page.flights[0];
   state.time = Math.max(0, Math.min(time, lastTime()));
   $("start").value = state.flight.start;
@@ -109,7 +110,7 @@ $("start").addEventListener("change", event => { choose(Number(event.target.valu
 $("rate").addEventListener("change", event => { state.rate = Number(event.target.value); });
 $("scrub").addEventListener("input", event => { play(false); seek(Number(event.target.value)); remember(); });
 $("follow").addEventListener("change", event => { scene.follow(event.target.checked, now()); });
-window.addEventListener("hashchange", () => { play(false); fromAddress(); });
+window.addEventListener("hashchange", fromAddress);
 window.addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey) return;
   const typed = event.target.tagName;
@@ -120,4 +121,4 @@ window.addEventListener("keydown", event => {
 });
 
 // What tests look at; `ready` resolves once the first start is drawn.
-window.qrlView = { state, page, place: () => scene.probe(now()), ready: fromAddress() };
+window.qrlView = { state, page, choose, place: () => scene.probe(now()), ready: fromAddress() };
