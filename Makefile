@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export sweep tasks bench test smoke lint torture FORCE
+.PHONY: help setup train evaluate export view sweep tasks bench test smoke lint torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -22,6 +22,8 @@ define HELP
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
        ARGS=--off-nominal              any flag of `qrl evaluate`
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
+  make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
+       ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE
   make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
@@ -50,6 +52,7 @@ $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("mak
 $(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/pendulum_lr.json)
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
 $(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
+$(call need,view,$(RUN),RUN is missing: make view RUN=runs/circle)
 
 train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
@@ -61,6 +64,9 @@ evaluate: $(STAMP)
 # `export` is a directive of make itself where a line begins with it.
 $(or export): $(STAMP)
 	@exec $(QRL) export $(call quoted,$(RUN)) $(ARGS)
+
+view: $(STAMP)
+	@exec $(QRL) view $(call quoted,$(RUN)) $(ARGS)
 
 sweep: $(STAMP)
 	@exec $(QRL) sweep $(call quoted,$(GRID)) $(call flag,--out,$(OUT)) $(ARGS)

@@ -77,6 +77,13 @@ assert list(run.rglob("*tfevents*")), "nothing for TensorBoard"
 PYTHON
 }
 
+# The page "$1" is there, and no larger than promised.
+page() {
+  local size
+  size=$(wc -c <"$1") || fail "no page $1"
+  ((size > 4000000 && size <= 8000000)) || fail "the page $1 has $size bytes"
+}
+
 contents() {
   (cd "$1" && find . -type f -print0 | sort -z | xargs -0 sha256sum)
 }
@@ -108,6 +115,9 @@ pendulum_and_hover() {
   passes "build and run the exported example" make -C "$out/pendulum/seed-0/export/examples/bare_metal"
   grep -q '^torque: ' "$log/stdout" || fail "the example gave no torque"
   refuses "to export two seeds at once" "seed-0" "$qrl" export "$out/pendulum"
+  passes "view two seeds" make view RUN="$out/pendulum" ARGS="--starts 3 900"
+  page "$out/pendulum/seed-0/view.html"
+  page "$out/pendulum/seed-1/view.html"
 
   passes "train hover" make train TASK=hover SEED=3 OUT="$out/hover" ARGS="$budget"
   complete "$out/hover"
@@ -147,6 +157,8 @@ bad_input() {
   refuses "make train without TASK" "TASK is missing" make train
   refuses "make evaluate without RUN" "RUN is missing" make evaluate
   refuses "make export without RUN" "RUN is missing" make export
+  refuses "make view without RUN" "RUN is missing" make view
+  refuses "to view a run that is not there" "nowhere" "$qrl" view "$out/nowhere"
   refuses "a misspelt task" "'hover'" "$qrl" train hoverr --out "$out/no"
   refuses "a misspelt flag" "--stepz.*--steps" "$qrl" train hover --stepz 10 --out "$out/no"
   refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --steps many --out "$out/no"
@@ -167,6 +179,8 @@ circle_and_crazyflie() {
   complete "$out/circle"
   passes "evaluate circle" make evaluate RUN="$out/circle" ARGS="--starts 100"
   "$python" -m json.tool "$out/circle/evaluation.json" >"$log/stdout" 2>"$log/stderr" || fail "evaluation.json"
+  passes "view circle" make view RUN="$out/circle"
+  page "$out/circle/view.html"
 
   passes "train a vehicle of one's own" make train TASK="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
   complete "$out/crazyflie"

@@ -33,6 +33,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "conditions": 2,
         "__init__": 2,
         "picture": 3,
+        "viewer": 3,
     },
     "qrl": {
         "__init__": 0,
@@ -71,6 +72,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "export_command": 4,
         "train_command": 4,
         "evaluate_command": 4,
+        "view_command": 4,
         "deploy": 4,
         "commands": 4,
         "cli": 4,

@@ -1,15 +1,18 @@
 """How well a flight went: success, settle time, steady-state errors (DESIGN.md, "Evaluation").
 
-For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps. A flight with a number
-that is not finite, in any observation, is a failure.
+For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps, or asks `of_flights` for many. A
+flight with a number that is not finite, in any observation, is a failure.
 """
 
+import functools
 from typing import NamedTuple
 
 import chex
+import jax
 import jax.numpy as jnp
+import numpy as np
 
-from qrl_envs.task import FlightEvaluation, PendulumEvaluation
+from qrl_envs.task import CircleReward, FlightEvaluation, PendulumEvaluation, PendulumTask, Task
 
 
 class Errors(NamedTuple):
@@ -64,3 +67,33 @@ def summarise(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Ar
         "settle_s": jnp.where(flight.finite, settle_s(flight.within, dt_s), jnp.inf),
         **{name: jnp.where(jnp.isfinite(value), value, jnp.inf) for name, value in rms.items()},
     }
+
+
+class Measured(NamedTuple):
+    """What n flights measure, in NumPy."""
+
+    errors: dict[str, np.ndarray]  # name with unit -> [n, K + 1]
+    success: np.ndarray  # [n] bool
+    settle_s: np.ndarray  # [n]; infinite where it never settles
+
+
+def of_flights(task: Task, observations: np.ndarray) -> Measured:
+    """Errors, success and settle time of each of `observations` [n, K + 1, F], SI units, at times 0, dt, … K·dt."""
+    errors, summary = jax.tree.map(np.asarray, _of_flights(task, jnp.asarray(observations, jnp.float32)))
+    return Measured(errors, summary["success"] > 0, summary["settle_s"])
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _of_flights(task: Task, observations: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+    dt_s = task.control_period_s
+
+    def one(flight: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
+        if isinstance(task, PendulumTask):
+            found = pendulum(flight, task.evaluation)
+        elif isinstance(wanted := task.evaluation.reward, CircleReward):
+            found = circle(flight, task.evaluation, wanted.radius_m, wanted.speed_m_s)
+        else:
+            found = hover(flight, task.evaluation)
+        return found.errors, summarise(found, round(task.evaluation.tail_s / dt_s), dt_s)
+
+    return jax.vmap(one)(observations)

@@ -4,13 +4,10 @@ What is measured is what measures.py measures, and every tolerance drawn is the 
 from being saved, of matplotlib's objects alone: no pyplot, so no state is left behind.
 """
 
-import functools
 import textwrap
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -19,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MultipleLocator, NullFormatter
 
 from qrl_envs import measures
+from qrl_envs.measures import Measured
 from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
 
 SHOWN = 5  # flights drawn in full
@@ -34,14 +32,6 @@ ERRORS = {  # name in measures.py -> label; unit; name of its tolerance in the t
     "speed_m_s": ("speed error", "m/s", "speed_m_s"),
     "angle_rad": ("angle error", "rad", "angle_rad"),
 }
-
-
-class Measured(NamedTuple):
-    """What measures.py says of n flights."""
-
-    errors: dict[str, np.ndarray]  # name with unit -> [n, K + 1]
-    success: np.ndarray  # [n] bool
-    settle_s: np.ndarray  # [n]; infinite where it never settles
 
 
 class Panel(NamedTuple):
@@ -68,7 +58,7 @@ def errors(path: Path, task: Task, observations: np.ndarray) -> None:
 
 def flights_figure(task: Task, observations: np.ndarray) -> Figure:
     """What `flights` saves. Axes: where the first few went, and two quantities over time."""
-    found = _measure(task, observations)
+    found = measures.of_flights(task, observations)
     shown = np.where(np.isfinite(observations), observations, np.nan)[:SHOWN]
     figure = _figure(task, height_in=5.0)
     left, upper, lower = figure.subplot_mosaic("AB;AC", width_ratios=(1.0, 1.2)).values()
@@ -92,7 +82,7 @@ def flights_figure(task: Task, observations: np.ndarray) -> Figure:
 
 def errors_figure(task: Task, observations: np.ndarray) -> Figure:
     """What `errors` saves. Axes: the spread of each error over time, and last the share that has settled."""
-    found = _measure(task, observations)
+    found = measures.of_flights(task, observations)
     names = [name for name in ERRORS if name in found.errors]
     rows = len(names) // 2 + 1
     figure = _figure(task, height_in=2.0 + 2.0 * rows)
@@ -111,29 +101,6 @@ def errors_figure(task: Task, observations: np.ndarray) -> Figure:
         _finish(axes)
     _legend(figure)
     return figure
-
-
-def _measure(task: Task, observations: np.ndarray) -> Measured:
-    """measures.py of each of `observations` [n, K + 1, F]."""
-    errors, summary = jax.tree.map(np.asarray, _measured(task, jnp.asarray(observations, jnp.float32)))
-    return Measured(errors, summary["success"] > 0, summary["settle_s"])
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _measured(task: Task, observations: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-    """Errors [n, K + 1] and summary [n] of `observations` [n, K + 1, F]."""
-    dt_s = task.control_period_s
-
-    def one(flight: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-        if isinstance(task, PendulumTask):
-            found = measures.pendulum(flight, task.evaluation)
-        elif isinstance(wanted := task.evaluation.reward, CircleReward):
-            found = measures.circle(flight, task.evaluation, wanted.radius_m, wanted.speed_m_s)
-        else:
-            found = measures.hover(flight, task.evaluation)
-        return found.errors, measures.summarise(found, round(task.evaluation.tail_s / dt_s), dt_s)
-
-    return jax.vmap(one)(observations)
 
 
 # Where flights went

@@ -95,6 +95,17 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
         metavar="N",
     )
 
+    view = commands.add_parser("view", help="flights of a trained policy as a 3D page", allow_abbrev=False)
+    view.add_argument("run", type=Path, help="run folder", metavar="RUN")
+    view.add_argument(
+        "--starts",
+        type=whole_number,
+        nargs="+",
+        help="which of evaluate's 1,000 starts, by index (eight; first those that it found to fail)",
+        metavar="N",
+    )
+    view.add_argument("--out", type=Path, help="the page (RUN/view.html)", metavar="FILE")
+
     sweep = commands.add_parser(
         "sweep", help="train every point of a grid; the same command goes on", allow_abbrev=False
     )
@@ -137,7 +148,7 @@ def main(argv: list[str] | None = None) -> int:
     args = _parse(argv)
     if args.command == "train":
         print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
-    elif args.command in ("evaluate", "export"):
+    elif args.command in ("evaluate", "export", "view"):
         print(f"qrl {args.command} {args.run}: loading JAX and Brax", flush=True)
     elif args.command == "sweep":
         print(f"qrl sweep {args.grid}: loading JAX and Brax", flush=True)

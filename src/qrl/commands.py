@@ -60,6 +60,8 @@ def _command(name: str) -> Callable[[argparse.Namespace], int]:
             from qrl.evaluate_command import evaluate as command
         case "export":
             from qrl.export_command import export as command
+        case "view":
+            from qrl.view_command import view as command
         case "sweep":
             from qrl.sweep_command import sweep as command
         case _:
