@@ -32,7 +32,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "env": 2,
         "conditions": 2,
         "__init__": 2,
-        "picture": 3,
+        "pictures": 3,
     },
     "qrl": {
         "__init__": 0,

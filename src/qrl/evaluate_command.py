@@ -16,8 +16,8 @@ from qrl.learner import LearnerState
 from qrl.runs import RunConfig
 from qrl.terminal import console
 from qrl.train import Trainer, point, stack
-from qrl_envs import picture
 from qrl_envs.conditions import Condition, OffNominal, conditions
+from qrl_envs.pictures import errors
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask
 
@@ -46,7 +46,7 @@ def evaluate(args: argparse.Namespace) -> int:
         result, flights = _flown(folder, config.member(i), asked)
         runs.write_json(folder / "evaluation.json", result)
         if config.task.spec:
-            picture.errors(folder / "evaluation.png", request.spec(config.task), np.asarray(flights.observations))
+            errors.draw(folder / "evaluation.png", request.spec(config.task), np.asarray(flights.observations))
         table.append(result)
     if config.seeds > 1:
         runs.write_json(args.run / "evaluation.json", table)

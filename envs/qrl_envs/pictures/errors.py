@@ -1,0 +1,57 @@
+"""The errors of all flights over time, and how many of them have settled."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from qrl_envs.pictures.frame import COLOURS, empty, finish, legend
+from qrl_envs.pictures.measured import ERRORS, measure, successes
+from qrl_envs.pictures.overtime import Panel, logarithmic, over_time
+from qrl_envs.task import Task
+
+
+def draw(path: Path, task: Task, observations: np.ndarray) -> None:
+    """Draw the errors and settle times of all of `observations` [n, K + 1, F], SI units, at times 0, dt, … K·dt."""
+    figure(task, observations).savefig(path, format="png")
+
+
+def figure(task: Task, observations: np.ndarray) -> Figure:
+    """What `draw` saves. Axes: the spread of each error over time, and last the share that has settled."""
+    found = measure(task, observations)
+    names = [name for name in ERRORS if name in found.errors]
+    rows = len(names) // 2 + 1
+    figure = empty(task, height_in=2.0 + 2.0 * rows)
+    grid = list(figure.subplots(rows, 2, sharex=True).flat)
+    for axes, name in zip(grid, names, strict=False):
+        label, unit, tolerance = ERRORS[name]
+        panel = logarithmic(label, unit, _ranks(found.errors[name]), getattr(task.evaluation, tolerance))
+        times = over_time(axes, task, panel)
+        low, median, high = panel.values
+        axes.fill_between(times, low, high, color=COLOURS[0], alpha=0.3, linewidth=0, label="5 % to 95 % of flights")
+        axes.plot(times, median, color=COLOURS[0], linewidth=2, label="median flight")
+    _settled(grid[len(names)], task, found.settle_s, observations.shape[1])
+    for axes, title in zip(grid, (f"all {len(observations):,} flights", successes(found)), strict=False):
+        finish(axes, title)
+    for axes in grid[2:]:
+        finish(axes)
+    legend(figure)
+    return figure
+
+
+def _ranks(errors: np.ndarray) -> np.ndarray:
+    """Of |errors| [n, K + 1] at each time the one 5 %, 50 % and 95 % up the ranks: [3, K + 1].
+
+    A number that is not finite ranks last, as infinite: to measures.py it is a failure too.
+    """
+    ranked = np.sort(np.where(np.isfinite(errors), np.abs(errors), np.inf), axis=0)
+    return ranked[[round(share * (len(errors) - 1)) for share in (0.05, 0.5, 0.95)]]
+
+
+def _settled(axes: Axes, task: Task, settle_s: np.ndarray, samples: int) -> None:
+    """The share of flights that have settled, over time; `settle_s` [n]."""
+    times = np.arange(samples) * task.control_period_s
+    share = np.mean(settle_s[:, None] <= times + 0.5 * task.control_period_s, axis=0)
+    over_time(axes, task, Panel("flights settled", "%", 100.0 * share[None], (0.0, 103.0)))
+    axes.plot(times, 100.0 * share, color=COLOURS[1], linewidth=2, label="settled for good")
