@@ -20,7 +20,7 @@ from jax.flatten_util import ravel_pytree
 
 from qrl import buffer, laps, request, rollout, runs
 from qrl.learner import Learner
-from qrl.train import Trainer, TrainState, _effort, point, stack
+from qrl.train import Trainer, TrainState, effort, point, stack
 from qrl.types import Networks, Transition
 from qrl.vtrace import vtrace
 
@@ -62,7 +62,7 @@ def repeated(call: Callable[[Now, Any, chex.Array, chex.Array], Any], now: Now, 
     def all_of_it(now: Now, last: Any) -> Any:
         return jax.lax.scan(lambda last, i: (turn(now, last, i), None), last, jnp.arange(REPEATED))[0]
 
-    program = jax.jit(all_of_it, donate_argnums=1, compiler_options=_effort(1))
+    program = jax.jit(all_of_it, donate_argnums=1, compiler_options=effort(1))
     box = [jax.tree.map(jnp.array, first)]
 
     def timed() -> None:
@@ -218,7 +218,7 @@ def parts(task: str) -> tuple[list[Part], Callable[[], Any], int]:
 def product_rate() -> float:
     """Multiply-adds a second of [1600, 64] x [64, 64], at its best: what others take beside us is no floor."""
     a, b = jnp.ones((1600, 64)), jnp.full((64, 64), 1.0 / 64.0)
-    program = jax.jit(lambda a, b: jax.lax.fori_loop(0, 200, lambda _, x: x @ b, a), compiler_options=_effort(1))
+    program = jax.jit(lambda a, b: jax.lax.fori_loop(0, 200, lambda _, x: x @ b, a), compiler_options=effort(1))
     program(a, b).block_until_ready()
     times = []
     for _ in range(9):

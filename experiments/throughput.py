@@ -24,7 +24,7 @@ import numpy as np
 
 from qrl import buffer, laps, request, rollout, runs
 from qrl.learner import Learner
-from qrl.train import Trainer, _effort, point, spread, stack
+from qrl.train import Trainer, effort, point, spread, stack
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from rates import LANES, TRAINING, UNROLL_STEPS, rate
@@ -46,7 +46,7 @@ def acting(lanes: int, key: jax.Array) -> None:
     state = learner.init(key)
     longest = rollout.episode_steps(env, run.learner.episode_steps)
 
-    @partial(jax.jit, compiler_options=_effort(1))
+    @partial(jax.jit, compiler_options=effort(1))
     def unroll(state: Any, starts: Any, carry: Any) -> Any:
         now, key, _ = carry
         key, mine = jax.random.split(key)
@@ -75,7 +75,7 @@ def physics(lanes: int, key: jax.Array) -> None:
 
     blocks = max(1, lanes // rollout.BLOCK_LANES)
 
-    @partial(jax.jit, compiler_options=_effort(1))
+    @partial(jax.jit, compiler_options=effort(1))
     def steps(params: Any, thrusts: Any, bodies: Any) -> Any:
         each = jax.vmap(lambda body, thrust: quadrotor.step(params, body, thrust, dt_s))
 
@@ -108,7 +108,7 @@ def learning(minibatch_lanes: int, key: jax.Array) -> None:
     updates, shards = 64, run.learner.logical_shards
     state, ring, here = on_its_way()
 
-    @partial(jax.jit, compiler_options=_effort(1))
+    @partial(jax.jit, compiler_options=effort(1))
     def learn(ring: Any, here: Any, carry: Any) -> Any:
         state, key = carry
         key, mine = jax.random.split(key)

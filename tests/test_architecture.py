@@ -29,6 +29,8 @@ FLOORS: dict[str, dict[str, int]] = {
         "measures": 1,
         "ports": 1,
         "symmetry": 1,
+        "controllers": 1,
+        "failures": 1,
         "env": 2,
         "conditions": 2,
         "__init__": 2,
@@ -70,6 +72,8 @@ FLOORS: dict[str, dict[str, int]] = {
         "export_command": 4,
         "train_command": 4,
         "evaluate_command": 4,
+        "evaluate_table": 4,
+        "pilots": 4,
         "deploy": 4,
         "commands": 4,
         "cli": 4,
@@ -79,7 +83,7 @@ FLOORS: dict[str, dict[str, int]] = {
 # What each floor may import beside the standard library, on top of what the floors below it may; None: anything.
 ALLOWED: list[set[str] | None] = [
     {"jax", "numpy", "chex", "flax.struct", "pydantic"},
-    {"flax"},
+    {"flax", "scipy"},
     {"brax", "optax"},
     {"orbax", "matplotlib", "tensorboardX"},
     None,

@@ -110,9 +110,9 @@ class Trainer:
         self.learner = Learner(config, *sizes, SHARD if mesh else None)
         init = self._over_mesh(self._init_all, (P(MEMBER), P(MEMBER)), LAYOUT)
         advance = self._over_mesh(self._advance_all, (LAYOUT, P(MEMBER), P()), LAYOUT)
-        self.init = jax.jit(init, compiler_options=_effort(0))  # it runs once
-        self.advance = jax.jit(advance, donate_argnums=0, compiler_options=_effort(1))
-        self.fly = jax.jit(self._fly_evenly, compiler_options=_effort(1))
+        self.init = jax.jit(init, compiler_options=effort(0))  # it runs once
+        self.advance = jax.jit(advance, donate_argnums=0, compiler_options=effort(1))
+        self.fly = jax.jit(self._fly_evenly, compiler_options=effort(1))
         everywhere = NamedSharding(mesh, P()) if mesh else None
         self._everywhere = jax.jit(lambda tree: tree, out_shardings=everywhere)
         self._member = jax.jit(lambda states, i: jax.tree.map(lambda x: x[i], states), out_shardings=everywhere)
@@ -318,7 +318,7 @@ class Trainer:
         return evaluate.fly(env, lambda observation: learner.mean(shipped, observation), keys, self.longest)
 
 
-def _effort(level: int) -> dict[str, Any]:
+def effort(level: int) -> dict[str, Any]:
     """How hard XLA tries: on a CPU level 1 compiles in two thirds of the time of its own level, to the same speed."""
     least = jax.config.read("jax_disable_most_optimizations")
     return {"xla_backend_optimization_level": level} if jax.default_backend() == "cpu" and not least else {}
