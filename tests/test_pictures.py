@@ -12,6 +12,7 @@ from qrl import plots
 from qrl_envs import task
 from qrl_envs.pictures import errors as errors_of
 from qrl_envs.pictures import flights as flights_of
+from qrl_envs.pictures import settle
 
 Array = np.ndarray
 Row = dict[str, float | str]
@@ -207,6 +208,42 @@ def test_settled_is_a_share_of_all_starts() -> None:
     flights[3, :, 9], flights[3, 10, 9] = 0.0, np.nan
     (share,) = drawn(errors_of.figure(task.load("hover"), flights).axes[-1])
     np.testing.assert_allclose(share[[0, 29, 30, 59, 60, 100]], np.array([0, 0, 1, 1, 2, 2]) * 100 / FLIGHTS)
+
+
+def test_others_are_drawn_beside_by_their_medians() -> None:
+    """Of another that is twice as far off at each time; its share settled is its own."""
+    flights, other = np.zeros((FLIGHTS, SAMPLES, 18)), np.zeros((FLIGHTS, SAMPLES, 18))
+    flights[..., 9], other[..., 9] = 0.05, 0.2
+    distance, share = errors_of.figure(task.load("hover"), flights, {"another": other}).axes
+    np.testing.assert_allclose(lines(distance, "median of another")[0], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(lines(distance, "median flight")[0], 0.05, rtol=1e-6)
+    assert lines(share, "median of another")[0].max() == 0.0
+    assert drawn(share)[0].min() == 100.0
+
+
+def test_the_map_has_medians_by_tilt_and_speed() -> None:
+    """In the cell of their start; with too few flights it is empty, and half that never settle make it infinite."""
+    tilt = np.array([1.0, 2.0, 3.0, 170.0, 180.0, 175.0, 40.0, 40.0])
+    speed = np.array([0.1, 0.2, 0.3, 0.9, 0.9, 0.9, 0.1, 0.1])
+    settled = np.array([1.0, 5.0, 2.0, 3.0, np.inf, np.inf, 1.0, 1.0])
+    cells = settle.medians(tilt, speed, settled, np.array([0.0, 0.5, 1.0]))
+    assert cells[0, 0] == 2.0
+    assert np.isposinf(cells[1, -1])
+    assert np.isnan(cells).sum() == cells.size - 2
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_map_marks_the_starts_that_fail(tmp_path: Path) -> None:
+    flights = approach("hover")
+    flights[..., 9:12] = 0.0
+    flights[4:7, :, 9] = 5.0
+    (marks,) = settle.figure(task.load("hover"), flights).axes[0].lines
+    tilt = np.degrees(np.arccos(flights[4:7, 0, 8]))
+    np.testing.assert_allclose(marks.get_xdata(), tilt)
+    np.testing.assert_allclose(marks.get_ydata(), np.linalg.norm(flights[4:7, 0, 12:15], axis=1))
+    settle.draw(tmp_path / "a.png", task.load("hover"), with_faults(flights))
+    assert is_picture(tmp_path / "a.png")
+    assert can_be_drawn(settle.figure(task.load("hover"), np.full((3, SAMPLES, 18), np.nan)))
 
 
 def rows(returns: list[float], success: list[float | str] | None = None, every: float = 1e5) -> list[Row]:

@@ -78,8 +78,10 @@ def _named(worlds: Worlds) -> dict[str, Env]:
 
 def _each_kind(worlds: Worlds, compiling: Callable[[Env], Future]) -> dict[str, Future]:
     """By world the program for it: that of the nominal one, and one for all conditions."""
-    off = [compiling(env) for env in list(worlds.off_nominal.values())[:1]]
-    return {NOMINAL: compiling(worlds.nominal), **dict.fromkeys(worlds.off_nominal, off[0])}
+    programs = {NOMINAL: compiling(worlds.nominal)}
+    for any_of_them in list(worlds.off_nominal.values())[:1]:
+        programs |= dict.fromkeys(worlds.off_nominal, compiling(any_of_them))
+    return programs
 
 
 def _compiled_policy(env: Env, config: Config, starts: chex.PRNGKey) -> Program:

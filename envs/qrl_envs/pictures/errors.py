@@ -48,7 +48,7 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
         axes.plot(times, median, color=COLOURS[0], linewidth=2, label="median flight")
         for (other, there), looks in zip(beside.items(), LINES, strict=False):
             line = np.clip(_ranks(there.errors[name])[1], *panel.limits)
-            axes.plot(times, line, linewidth=1.1, label=f"median of {other}", **looks)
+            axes.plot(times, line, linewidth=1.1, label=f"median of {_short(other)}", **looks)
     _settled(grid[len(names)], task, found, beside, observations.shape[1])
     for axes, title in zip(grid, (f"all {len(observations):,} flights", successes(found)), strict=False):
         finish(axes, title)
@@ -56,6 +56,11 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
         finish(axes)
     legend(figure)
     return figure
+
+
+def _short(name: str) -> str:
+    """The end of a folder's long name, which tells it from others."""
+    return name if len(name) <= 24 else f"…{name[-23:]}"
 
 
 def _ranks(errors: np.ndarray) -> np.ndarray:
@@ -77,4 +82,4 @@ def _settled(axes: Axes, task: Task, found: Measured, beside: dict[str, Measured
     over_time(axes, task, Panel("flights settled", "%", share(found.settle_s)[None], (0.0, 103.0)))
     axes.plot(times, share(found.settle_s), color=COLOURS[0], linewidth=2)
     for (other, there), looks in zip(beside.items(), LINES, strict=False):
-        axes.plot(times, share(there.settle_s), linewidth=1.1, label=f"median of {other}", **looks)
+        axes.plot(times, share(there.settle_s), linewidth=1.1, label=f"median of {_short(other)}", **looks)

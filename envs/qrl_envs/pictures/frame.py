@@ -41,8 +41,14 @@ def legend(figure: Figure) -> None:
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
+    rows = 1 if len(handles) < 5 else 2
     figure.legend(
-        handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles), frameon=False, fontsize=10.5
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=-(-len(handles) // rows),
+        frameon=False,
+        fontsize=10.5,
     )
 
 
