@@ -20,7 +20,7 @@ define HELP
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--steps 2e6"              any other flag of `qrl train`; `qrl train --help` lists them
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
-       ARGS=--off-nominal              any flag of `qrl evaluate`
+       ARGS=--off-nominal              any flag of `qrl evaluate`; "--beside runs/ppo": other runs too
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
   make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results

@@ -168,6 +168,9 @@ circle_and_crazyflie() {
   passes "evaluate circle" make evaluate RUN="$out/circle" ARGS="--starts 100"
   "$python" -m json.tool "$out/circle/evaluation.json" >"$log/stdout" 2>"$log/stderr" || fail "evaluation.json"
 
+  grep -q geometric "$out/circle/evaluation.json" || fail "no baselines"
+  [[ -s $out/circle/settle.png ]] || fail "no map of settle times"
+
   passes "train a vehicle of one's own" make train TASK="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
   complete "$out/crazyflie"
   passes "repeat it from its config.json" make train CONFIG="$out/crazyflie/config.json" OUT="$out/again"

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MultipleLocator
 
 from qrl_envs.failures import speed_m_s, tilt_deg
@@ -16,6 +17,7 @@ TILT_EDGES_DEG = np.linspace(0.0, 180.0, 13)
 SPEEDS = 8  # cells
 LEAST = 3  # flights that a cell's median is of
 FAILED = "#D55E00"
+MANY = 50  # crosses that may be large
 
 
 def draw(path: Path, task: QuadrotorTask, observations: np.ndarray) -> None:
@@ -40,8 +42,8 @@ def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
             speed[failed],
             "x",
             color=FAILED,
-            markersize=9,
-            markeredgewidth=2.2,
+            markersize=9 if failed.sum() <= MANY else 5,
+            markeredgewidth=2.2 if failed.sum() <= MANY else 1.2,
             label="a start that fails",
             clip_on=False,
         )
@@ -97,4 +99,6 @@ def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> No
             va="center",
             fontsize=9.5,
             color="white" if dark else INK,
+            zorder=5,
+            path_effects=[] if not never else [withStroke(linewidth=3, foreground="white")],  # over the crosses
         )
