@@ -20,7 +20,7 @@ define HELP
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--steps 2e6"              any other flag of `qrl train`; `qrl train --help` lists them
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
-       ARGS=--off-nominal              any flag of `qrl evaluate`
+       ARGS=--off-nominal              any flag of `qrl evaluate`; "--beside runs/ppo": other runs too
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
   make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
        ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE

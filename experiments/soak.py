@@ -31,7 +31,8 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("experiments/out/soak"))
     args = parser.parse_args()
     reports = max(4, round(args.steps / REPORT_STEPS))
-    run = request.run_config("hover", None, runs.ConfigFile(), {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}, 0, 1)
+    long = {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}
+    run = request.run_config("hover", None, runs.ConfigFile(), long, 0, 1)
     if args.out.exists():
         print(f"{args.out}: exists already; give another --out", file=sys.stderr)
         return 2

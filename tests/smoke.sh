@@ -182,6 +182,9 @@ circle_and_crazyflie() {
   passes "view circle" make view RUN="$out/circle"
   page "$out/circle/view.html"
 
+  grep -q geometric "$out/circle/evaluation.json" || fail "no baselines"
+  [[ -s $out/circle/settle.png ]] || fail "no map of settle times"
+
   passes "train a vehicle of one's own" make train TASK="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
   complete "$out/crazyflie"
   passes "repeat it from its config.json" make train CONFIG="$out/crazyflie/config.json" OUT="$out/again"

@@ -75,11 +75,58 @@ def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixtur
     for i, before in enumerate(plain):
         result = json.loads((run / f"seed-{i}" / "evaluation.json").read_text())
         off = result.pop("off_nominal")
+        for name, baseline in result["baselines"].items():
+            there = baseline.pop("off_nominal")
+            assert there.keys() == off.keys()
+            assert len({each["return_mean"] for each in (baseline, *there.values())}) == 5, name
         assert result == before
+        assert result["baselines"].keys() == {"geometric", "lqr"}
         assert off.keys() == {"rk4", "latency", "noise", "together"}
         assert len({each["return_mean"] for each in (result, *off.values())}) == 5
         assert f"seed {i}," in said
-    assert said.count("nominal         rk4     latency       noise    together") == 2
+    assert said.count("nominal         rk4     latency       noise    together") == 4  # two seeds, two controllers
+    assert "seed 0      seed 1   geometric         lqr" in said
+    assert (run / "seed-0" / "settle.png").exists()
+
+
+def test_evaluate_flies_other_runs_beside(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """From the same starts, a column each: a run beside itself flies the same; what fails is said by its start."""
+    run = shutil.copytree(trained, tmp_path / "run")
+    assert qrl("evaluate", run, "--starts", "5", "--beside", trained) == 0
+    result = json.loads((run / "evaluation.json").read_text())
+    beside = result["beside"][str(trained)]
+    assert {name: result[name] for name in beside} == beside
+    said = capsys.readouterr().out
+    assert str(trained) in said
+    assert result["failed"] == len(result["failures"]) == round(5 * (1 - result["success"]))
+    assert [each.keys() for each in result["failures"]] == [{"start", "angle_rad", "rate_rad_s", "reason"}] * 5
+    assert "5 of 5 starts failed: 0 1 2 3 4 (qrl view RUN --starts 0 replays one)" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"name": "hover", "spec": {"extend": "hover"}}, "found one of 'hover'"),
+        ({"evaluation": {"tail_s": 1.0}}, "'pendulum' that differs"),
+        (None, "not a run folder"),
+    ],
+)
+def test_beside_refuses_another_task(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: dict | None, says: str
+) -> None:
+    """By its name, and by how it is judged; before anything is flown."""
+    other = tmp_path / "other"
+    other.mkdir()
+    if change:
+        config = json.loads((trained / "config.json").read_text())
+        if "name" in change:
+            config["task"] = change
+        else:
+            config["task"]["spec"]["evaluation"] |= change["evaluation"]
+        (other / "config.json").write_text(json.dumps(config))
+    line = complaint(capsys, "evaluate", trained, "--starts", "5", "--beside", other)
+    assert says in line
+    assert str(other) in line
 
 
 def test_off_nominal_is_for_quadrotors(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

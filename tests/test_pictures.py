@@ -9,7 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qrl import plots
-from qrl_envs import picture, task
+from qrl_envs import task
+from qrl_envs.pictures import errors as errors_of
+from qrl_envs.pictures import flights as flights_of
+from qrl_envs.pictures import settle
 
 Array = np.ndarray
 Row = dict[str, float | str]
@@ -82,7 +85,7 @@ def band(axes: Axes, x: float) -> tuple[float, float]:
 
 
 @each_task
-@pytest.mark.parametrize("draw", [picture.flights, picture.errors])
+@pytest.mark.parametrize("draw", [flights_of.draw, errors_of.draw])
 def test_a_picture_is_drawn_whatever_the_numbers(name: str, draw, tmp_path: Path) -> None:
     draw(tmp_path / "a.png", task.load(name), with_faults(approach(name)))
     assert is_picture(tmp_path / "a.png")
@@ -92,21 +95,21 @@ def test_a_picture_is_drawn_whatever_the_numbers(name: str, draw, tmp_path: Path
 @each_task
 def test_nothing_but_faults(name: str) -> None:
     nothing = np.full(approach(name).shape, np.nan)
-    assert picture.flights_figure(task.load(name), nothing).axes[1].get_title() == "0 of 21 flights succeed"
-    assert max(drawn(picture.errors_figure(task.load(name), nothing).axes[-1])[0]) == 0.0
+    assert flights_of.figure(task.load(name), nothing).axes[1].get_title() == "0 of 21 flights succeed"
+    assert max(drawn(errors_of.figure(task.load(name), nothing).axes[-1])[0]) == 0.0
 
 
 def test_one_flight_is_enough() -> None:
     odd = task.load("circle").model_copy(update={"description": "a title is no mathematics: $\\frac$"})
-    figure = picture.flights_figure(odd, approach("circle", 1))
+    figure = flights_of.figure(odd, approach("circle", 1))
     assert can_be_drawn(figure)
     assert figure.axes[0].get_title() == "the first 1 of 1 flights"
-    assert picture.errors_figure(task.load("circle"), approach("circle", 1)).axes[0].get_title() == "all 1 flights"
+    assert errors_of.figure(task.load("circle"), approach("circle", 1)).axes[0].get_title() == "all 1 flights"
 
 
 def test_the_title_says_the_task_and_the_counts() -> None:
     flights = with_faults(np.zeros((FLIGHTS, SAMPLES, 18)))
-    figure = picture.flights_figure(task.load("hover"), flights)
+    figure = flights_of.figure(task.load("hover"), flights)
     assert figure.get_suptitle() == f"hover: {task.load('hover').description}"
     assert [axes.get_title() for axes in figure.axes[:2]] == ["the first 5 of 21 flights", "18 of 21 flights succeed"]
 
@@ -133,9 +136,9 @@ OTHER: dict[str, tuple[dict, list[list[float]], list[list[float]]]] = {  # task 
 def test_tolerances_are_the_tasks(name: str) -> None:
     changes, in_flights, in_errors = OTHER[name]
     other = task.from_data({"extend": name, **changes}, "other.json")
-    figure = picture.flights_figure(other, approach(name))
+    figure = flights_of.figure(other, approach(name))
     assert tolerances(figure) == in_flights
-    assert tolerances(picture.errors_figure(other, approach(name))) == in_errors
+    assert tolerances(errors_of.figure(other, approach(name))) == in_errors
     for line in figure.axes[0].lines:
         if line.get_label() == "wanted path":
             np.testing.assert_allclose(np.linalg.norm(line.get_xydata(), axis=1), 1.25)
@@ -143,7 +146,7 @@ def test_tolerances_are_the_tasks(name: str) -> None:
 
 def test_what_is_drawn_is_what_was_flown() -> None:
     flights = approach("circle")
-    above, distance, speed = picture.flights_figure(task.load("circle"), flights).axes
+    above, distance, speed = flights_of.figure(task.load("circle"), flights).axes
     x, y, z, vx, vy = np.moveaxis(flights[:5, :, 9:14], -1, 0)
     np.testing.assert_allclose(drawn(above), y, rtol=1e-5)
     wanted = np.hypot(np.hypot(x, y) - 1, z)
@@ -154,7 +157,7 @@ def test_what_is_drawn_is_what_was_flown() -> None:
 def test_a_start_upside_down_is_marked() -> None:
     flights = approach("hover")
     flights[:5, 0, 8] = [0.9, -0.9, -0.2, -1.0, np.nan]
-    upright, upside_down = picture.flights_figure(task.load("hover"), flights).axes[0].collections
+    upright, upside_down = flights_of.figure(task.load("hover"), flights).axes[0].collections
     np.testing.assert_allclose(upright.get_offsets(), flights[:1, 0, 9:11])
     np.testing.assert_allclose(upside_down.get_offsets(), flights[1:4, 0, 9:11])
 
@@ -164,7 +167,7 @@ def test_no_line_jumps_where_the_angle_wraps() -> None:
     theta = np.stack([9 * np.sin(5 * t), np.pi + 0.05 * np.sin(90 * t + 1)])  # round and round; to and fro at the seam
     flights = np.full((FLIGHTS, SAMPLES, 3), np.nan)
     flights[:2] = np.stack([np.cos(theta), np.sin(theta), np.gradient(theta, t, axis=1)], -1)
-    portrait, angle, _ = picture.flights_figure(task.load("pendulum"), flights).axes
+    portrait, angle, _ = flights_of.figure(task.load("pendulum"), flights).axes
     copies = np.array(drawn(angle))
     assert np.abs(np.diff(copies, axis=1)).max() < 1.0
     jumps = [np.abs(np.diff(np.asarray(line.get_xdata(), float))).max(initial=0.0) for line in portrait.lines]
@@ -181,7 +184,7 @@ def test_errors_are_ranked_over_all_flights_by_their_size() -> None:
     height[::2] *= -1.0
     flights = approach("circle")
     flights[..., 11] = np.random.default_rng(0).permutation(height)[:, None]
-    axes = picture.errors_figure(task.load("circle"), flights).axes[1]
+    axes = errors_of.figure(task.load("circle"), flights).axes[1]
     assert axes.get_ylabel() == "height error [m]"
     np.testing.assert_allclose(lines(axes, "median flight")[0], 1.2, rtol=1e-6)
     np.testing.assert_allclose(band(axes, 0.5), (0.3, 2.1), rtol=1e-6)
@@ -191,7 +194,7 @@ def test_a_fault_ranks_last() -> None:
     flights = np.zeros((FLIGHTS, SAMPLES, 18))
     flights[..., 9] = 0.05
     flights[10:, 30:] = np.nan
-    axes = picture.errors_figure(task.load("hover"), flights).axes[0]
+    axes = errors_of.figure(task.load("hover"), flights).axes[0]
     (median,) = lines(axes, "median flight")
     np.testing.assert_allclose(median[:30], 0.05, rtol=1e-6)
     np.testing.assert_allclose(median[30:], axes.get_ylim()[1])
@@ -203,8 +206,44 @@ def test_settled_is_a_share_of_all_starts() -> None:
     flights[0, 30:, 9] = flights[1, 60:, 9] = 0.0
     flights[2, 20:80, 9] = 0.0  # leaves again
     flights[3, :, 9], flights[3, 10, 9] = 0.0, np.nan
-    (share,) = drawn(picture.errors_figure(task.load("hover"), flights).axes[-1])
+    (share,) = drawn(errors_of.figure(task.load("hover"), flights).axes[-1])
     np.testing.assert_allclose(share[[0, 29, 30, 59, 60, 100]], np.array([0, 0, 1, 1, 2, 2]) * 100 / FLIGHTS)
+
+
+def test_others_are_drawn_beside_by_their_medians() -> None:
+    """Of another that is twice as far off at each time; its share settled is its own."""
+    flights, other = np.zeros((FLIGHTS, SAMPLES, 18)), np.zeros((FLIGHTS, SAMPLES, 18))
+    flights[..., 9], other[..., 9] = 0.05, 0.2
+    distance, share = errors_of.figure(task.load("hover"), flights, {"another": other}).axes
+    np.testing.assert_allclose(lines(distance, "median of another")[0], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(lines(distance, "median flight")[0], 0.05, rtol=1e-6)
+    assert lines(share, "median of another")[0].max() == 0.0
+    assert drawn(share)[0].min() == 100.0
+
+
+def test_the_map_has_medians_by_tilt_and_speed() -> None:
+    """In the cell of their start; with too few flights it is empty, and half that never settle make it infinite."""
+    tilt = np.array([1.0, 2.0, 3.0, 170.0, 180.0, 175.0, 40.0, 40.0])
+    speed = np.array([0.1, 0.2, 0.3, 0.9, 0.9, 0.9, 0.1, 0.1])
+    settled = np.array([1.0, 5.0, 2.0, 3.0, np.inf, np.inf, 1.0, 1.0])
+    cells = settle.medians(tilt, speed, settled, np.array([0.0, 0.5, 1.0]))
+    assert cells[0, 0] == 2.0
+    assert np.isposinf(cells[1, -1])
+    assert np.isnan(cells).sum() == cells.size - 2
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_map_marks_the_starts_that_fail(tmp_path: Path) -> None:
+    flights = approach("hover")
+    flights[..., 9:12] = 0.0
+    flights[4:7, :, 9] = 5.0
+    (marks,) = settle.figure(task.load("hover"), flights).axes[0].lines
+    tilt = np.degrees(np.arccos(flights[4:7, 0, 8]))
+    np.testing.assert_allclose(marks.get_xdata(), tilt)
+    np.testing.assert_allclose(marks.get_ydata(), np.linalg.norm(flights[4:7, 0, 12:15], axis=1))
+    settle.draw(tmp_path / "a.png", task.load("hover"), with_faults(flights))
+    assert is_picture(tmp_path / "a.png")
+    assert can_be_drawn(settle.figure(task.load("hover"), np.full((3, SAMPLES, 18), np.nan)))
 
 
 def rows(returns: list[float], success: list[float | str] | None = None, every: float = 1e5) -> list[Row]:

@@ -1,11 +1,11 @@
 """Flights under other conditions than those that a policy trains in: plant, latency, sensors, start.
 
 An `OffNominal` environment is the task's own but for its condition, and judged as the task is, on the true state. What
-a policy sees where sensors err stands in `info["sensed"]`, beside the true `obs`. Sizes are of the project's own bar,
+a policy sees stands in `info["sensed"]`, beside the true `obs`. Sizes are of the project's own bar,
 the trial's start is the paper's (its figure of a hovering trial).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from brax.envs.base import State
 
 from qrl_envs import quadrotor, rotation
-from qrl_envs.env import Params, QuadrotorEnv
-from qrl_envs.quadrotor import Body, Physics, Pose, Twist
+from qrl_envs.env import QuadrotorEnv
+from qrl_envs.quadrotor import Body, Pose, Twist
 from qrl_envs.task import QuadrotorTask
 
 FINE_STEP_S = 0.001
@@ -55,47 +55,72 @@ def conditions(task: QuadrotorTask) -> dict[str, Condition]:
     return named
 
 
+class Conditioned(NamedTuple):
+    """A `Params` that says the condition too: as numbers, so that one compiled program flies under any."""
+
+    physics: Any
+    reward: Any
+    start: Any
+    bounds: Any
+    fine: chex.Array  # [] bool, as the other two
+    late: chex.Array
+    trial: chex.Array
+    noise: Noise  # of zeros: sensors say what is
+
+
 class OffNominal(QuadrotorEnv):
-    """A quadrotor task under a condition. The same key gives the nominal start, but for what the condition sets."""
+    """A quadrotor task under a condition. The same key gives the nominal start, but for what the condition sets.
+
+    The condition is among the parameters: `under` those of another OffNominal of the same task, it is the other's.
+    """
 
     def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
         super().__init__(task)
-        self._condition = condition
+        noise = Noise(*map(jnp.float32, condition.noise or Noise(0.0, 0.0, 0.0, 0.0)))
+        flags = (jnp.bool_(flag) for flag in (condition.fine, condition.late, condition.trial))
+        self.params: Any = Conditioned(*self.params, *flags, noise)
 
     def step(self, state: State, action: chex.Array) -> State:
-        info = dict(state.info)
-        if self._condition.late:
-            action, info["waiting"] = info["waiting"], action
-        return self._sense(super().step(state.replace(info=info), action))
+        late = state.pipeline_state.params.late
+        info = {**state.info, "waiting": action}
+        return self._sense(super().step(state.replace(info=info), jnp.where(late, state.info["waiting"], action)))
 
-    def _begin(self, params: Params, rng: chex.PRNGKey) -> State:
+    def _begin(self, params: Any, rng: chex.PRNGKey) -> State:
         state = super()._begin(params, rng)
-        info = dict(state.info)
-        if self._condition.late:
-            info["waiting"] = jnp.zeros(self.action_size)
-        if self._condition.noise:
-            info["sensor_key"] = jax.random.fold_in(rng, _SENSORS)
-        return self._sense(state.replace(info=info))
+        key = jax.random.fold_in(rng, _SENSORS)
+        return self._sense(
+            state.replace(info={**state.info, "waiting": jnp.zeros(self.action_size), "sensor_key": key})
+        )
 
-    def _draw(self, params: Params, rng: chex.PRNGKey) -> Body:
+    def _draw(self, params: Any, rng: chex.PRNGKey) -> Body:
         body = super()._draw(params, rng)
-        if not self._condition.trial:
-            return body
-        position, velocity = jnp.array(TRIAL_POSITION_M), jnp.array(TRIAL_VELOCITY_M_S)
+        trial = jnp.array(TRIAL_POSITION_M), jnp.array(TRIAL_VELOCITY_M_S)
+        position, velocity = (
+            jnp.where(params.trial, *pair)
+            for pair in zip(trial, (body.pose.position_m, body.twist.velocity_m_s), strict=True)
+        )
         return Body(body.pose._replace(position_m=position), body.twist._replace(velocity_m_s=velocity))
 
-    def _move(self, physics: Physics, x: Body, thrust: chex.Array) -> Body:
-        if not self._condition.fine:
-            return super()._move(physics, x, thrust)
-        dt_s = self.task.control_period_s
-        return quadrotor.step_finely(physics, x, thrust, dt_s, max(1, round(dt_s / FINE_STEP_S)))
+    def _advance(self, params: Any, x: Body, action: chex.Array) -> tuple[Body, chex.Array]:
+        thrust, dt_s = quadrotor.thrust_N(params.physics, action), self.task.control_period_s
+        parts = max(1, round(dt_s / FINE_STEP_S))
+        body = jax.tree.map(
+            lambda fine, rough: jnp.where(params.fine, fine, rough),
+            quadrotor.step_finely(params.physics, x, thrust, dt_s, parts),
+            quadrotor.step(params.physics, x, thrust, dt_s),
+        )
+        return body, params.reward(body, quadrotor.applied_action(params.physics, thrust))
 
     def _sense(self, state: State) -> State:
-        if not self._condition.noise:
-            return state
         later, now = jax.random.split(state.info["sensor_key"])
-        measured = erring(state.pipeline_state.x, self._condition.noise, now)
-        return state.replace(info={**state.info, "sensor_key": later, "sensed": quadrotor.observe(measured)})
+        lane = state.pipeline_state
+        return state.replace(
+            info={
+                **state.info,
+                "sensor_key": later,
+                "sensed": quadrotor.observe(erring(lane.x, lane.params.noise, now)),
+            }
+        )
 
 
 def erring(body: Body, noise: Noise, key: chex.PRNGKey) -> Body:

@@ -150,12 +150,8 @@ class QuadrotorEnv(TaskEnv):
 
     def _advance(self, params: Params, x: quadrotor.Body, action: chex.Array) -> tuple[quadrotor.Body, chex.Array]:
         thrust = quadrotor.thrust_N(params.physics, action)
-        body = self._move(params.physics, x, thrust)
+        body = quadrotor.step(params.physics, x, thrust, self.task.control_period_s)
         return body, params.reward(body, quadrotor.applied_action(params.physics, thrust))
-
-    def _move(self, physics: quadrotor.Physics, x: quadrotor.Body, thrust: chex.Array) -> quadrotor.Body:
-        """The plant: one control period under constant thrust [4] [N]."""
-        return quadrotor.step(physics, x, thrust, self.task.control_period_s)
 
     def _observe(self, x: quadrotor.Body) -> chex.Array:
         return quadrotor.observe(x)

@@ -82,6 +82,9 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     evaluate.add_argument(
         "--off-nominal", action="store_true", help="also under RK4, latency, sensor noise; hover: the paper's trial"
     )
+    evaluate.add_argument(
+        "--beside", type=Path, nargs="+", default=[], help="other runs of the same task, a column each", metavar="RUN"
+    )
     evaluate.add_argument("--checkpoints", type=count, default=1, help="the last so many checkpoints (1)", metavar="K")
 
     export = commands.add_parser("export", help="emit a trained policy as a C kernel, proved", allow_abbrev=False)

@@ -80,7 +80,7 @@ class Config(BaseModel):
     )
     apg_lanes: Static[Count] = Field(description="flights of one such update")
     apg_steps: Static[Count] = Field(description="steps of such a flight")
-    apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; linear to 0")
+    apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; to 0 along a cosine")
 
     gamma: Traced[Fraction] = Field(description="discount")
     lam: Traced[Fraction] = Field(description="lambda of the trace; 1 in the paper")
@@ -153,7 +153,7 @@ class Config(BaseModel):
         return self.unrolls - self.climbs * self.unrolls_per_climb
 
     def work(self, first: int, last: int) -> float:
-        """What there is to do from `first` to `last` unrolls, in steps flown or learnt from: for the time that is left."""
+        """What there is to do from `first` to `last` unrolls, in steps flown or learnt from."""
         replayed = self.updates_per_unroll * self.minibatch_lanes / self.lanes
         learning = min(last, self.learning_unrolls) - min(first, self.learning_unrolls)
         return self.unroll_size * ((last - first) + replayed * learning)

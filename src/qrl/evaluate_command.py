@@ -1,128 +1,179 @@
-"""`qrl evaluate`: a run's policies flown from fresh starts; also off nominal, and those of its last checkpoints."""
+"""`qrl evaluate`: a run's policies flown from fresh starts, beside classical controllers and other runs."""
 
 import argparse
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import chex
 import jax
-import numpy as np
 
-from qrl import request, restore, runs
+from qrl import evaluate_table, request, restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE
-from qrl.learner import LearnerState
+from qrl.pilots import NOMINAL, Baselines, Policies, Worlds
 from qrl.runs import RunConfig
-from qrl.state import point, stack
 from qrl.terminal import console
-from qrl.train import Trainer
-from qrl_envs import picture
+from qrl_envs import failures
 from qrl_envs.conditions import Condition, OffNominal, conditions
+from qrl_envs.pictures import errors, settle
 from qrl_envs.specfile import BadInput
-from qrl_envs.task import QuadrotorTask
+from qrl_envs.task import QuadrotorTask, Task
+
+MOST_FAILURES = 50  # that evaluation.json lists
 
 
-class Asked(NamedTuple):
-    """What to fly, and how."""
+class Run(NamedTuple):
+    """A run folder, and who flies its policies."""
 
-    nominal: Trainer
-    off_nominal: dict[str, Trainer]  # by condition
-    starts: chex.PRNGKey
-    checkpoints: int  # at most so many, from the last
+    folder: Path
+    config: RunConfig
+    policies: Policies
+
+
+@dataclass(frozen=True)
+class Flown:
+    """What was flown beside a policy: what evaluation.json says of it, and its nominal flights."""
+
+    baselines: dict[str, dict[str, Any]]
+    beside: dict[str, dict[str, Any]]
+    flights: dict[str, Flights]  # of all of these, by name
 
 
 def evaluate(args: argparse.Namespace) -> int:
-    """Fly every seed of a run from fresh starts; print a table, leave evaluation.json and a plot in each folder."""
+    """Fly every seed of a run from fresh starts; print a table, leave evaluation.json and plots in each folder."""
     config = request.stored(args.run)
-    off = _conditions(args.run, config) if args.off_nominal else {}
-    asked = Asked(
-        nominal=Trainer(request.environment(config.task), config.learner),
-        off_nominal={name: Trainer(env, config.learner) for name, (_, env) in off.items()},
+    others = [(folder, _of_same_task(folder, args.run, config)) for folder in args.beside]
+    task = request.spec(config.task) if config.task.spec else None
+    named = _conditions(args.run, config, task) if args.off_nominal else {}
+    worlds = Worlds(
+        nominal=request.environment(config.task),
+        off_nominal={name: OffNominal(task, condition) for name, condition in named.items()}  # pyright: ignore[reportArgumentType]
+        if named
+        else {},
         starts=jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), args.starts),
-        checkpoints=args.checkpoints,
     )
-    table: list[dict[str, Any]] = []
-    for i, folder in enumerate(runs.members(args.run, config)):
-        result, flights = _flown(folder, config.member(i), asked)
+    with ThreadPoolExecutor() as aside:
+        run = Run(args.run, config, Policies(worlds, config.learner, aside))
+        others = [Run(folder, other, Policies(worlds, other.learner, aside)) for folder, other in others]
+        baselines = Baselines(worlds, task, aside) if isinstance(task, QuadrotorTask) else None
+        results = [_evaluated(run, i, args.checkpoints, task) for i in range(config.seeds)]
+        flown = _flown(baselines, others)
+    table = [{**result, **_beside(flown)} for result, _ in results]
+    for folder, result, (_, flights) in zip(runs.members(args.run, config), table, results, strict=True):
         runs.write_json(folder / "evaluation.json", result)
-        if config.task.spec:
-            picture.errors(folder / "evaluation.png", request.spec(config.task), np.asarray(flights.observations))
-        table.append(result)
+        if task:
+            _draw(folder, task, flights, flown)
     if config.seeds > 1:
         runs.write_json(args.run / "evaluation.json", table)
     console.print(f"{config.task.name}: {args.starts:,} fresh starts, deterministic policy")
-    if args.checkpoints > 1:
-        for result in table:
-            _print_checkpoints(result)
-    if off:
-        console.print("\noff nominal:")
-        for name, (condition, _) in off.items():
-            console.print(f"  {name}: {condition.says}")
-        for result in table:
-            _print_off_nominal(result)
-    if args.checkpoints == 1 and not off:
-        _print_table("seed", {str(result["seed"]): result for result in table})
+    _print(table, flown, named)
     return DONE
 
 
-def _conditions(folder: Path, config: RunConfig) -> dict[str, tuple[Condition, OffNominal]]:
-    """The off-nominal conditions of a run's task, and its environment under each."""
-    task = request.spec(config.task) if config.task.spec else None
+def _conditions(folder: Path, config: RunConfig, task: Task | None) -> dict[str, Condition]:
+    """The off-nominal conditions of a run's task."""
     if not isinstance(task, QuadrotorTask):
         raise BadInput(
             f"{folder}: --off-nominal: expected a run of hover, circle or another quadrotor, found '{config.task.name}'"
         )
-    return {name: (condition, OffNominal(task, condition)) for name, condition in conditions(task).items()}
+    return conditions(task)
 
 
-def _flown(folder: Path, config: RunConfig, asked: Asked) -> tuple[dict[str, Any], Flights]:
-    """What evaluation.json says of one seed, and the nominal flights of its last checkpoint."""
+def _of_same_task(folder: Path, run: Path, config: RunConfig) -> RunConfig:
+    """The run in `folder`, if what it flies and how that is judged are as in `run`, whatever it trained on."""
+    other = request.stored(folder)
+    if other.task.name != config.task.name or _judged(other) != _judged(config):
+        raise BadInput(
+            f"{folder}: --beside: expected a run of the same task as {run}, '{config.task.name}', found one of"
+            f" '{other.task.name}'{' that differs' if other.task.name == config.task.name else ''}"
+        )
+    return other
 
-    def fly(trainer: Trainer, learner: LearnerState) -> Flights:
-        points = stack([point(trainer.env, config.learner)])
-        return jax.tree.map(lambda x: x[0], trainer.fly(learner, points, asked.starts))
 
+def _judged(config: RunConfig) -> dict[str, Any]:
+    """What of a task all pilots share; how it trained, and by what name, is each run's own."""
+    own = ("description", "preset", "start", "envelope", "episode_steps", "reward")
+    return {key: value for key, value in (config.task.spec or {}).items() if key not in own}
+
+
+def _saved(run: Run, seed: int, most: int) -> Iterator[tuple[Any, int]]:
+    """Learner and environment steps of a seed's checkpoints, newest first."""
+    folder = runs.members(run.folder, run.config)[seed]
     try:
-        saved = restore.newest(asked.nominal, config, folder, asked.checkpoints)
-        state, env_steps = next(saved)
-        flights, learner = fly(asked.nominal, state.learner), state.learner
-        last = {"env_steps": env_steps, **summarise(flights)}
-        earlier = [{"env_steps": steps, **summarise(fly(asked.nominal, state.learner))} for state, steps in saved]
+        for state, env_steps in restore.newest(run.policies.trainer, run.config.member(seed), folder, most):
+            yield state.learner, env_steps
     except OSError as error:
         raise BadInput(str(error)) from None
-    result: dict[str, Any] = {"seed": config.seed, "starts": len(asked.starts), **last}
-    if asked.checkpoints > 1:
+
+
+def _evaluated(run: Run, seed: int, most: int, task: Task | None) -> tuple[dict[str, Any], Flights]:
+    """What evaluation.json says of one seed, and the nominal flights of its last checkpoint."""
+    saved = _saved(run, seed, most)
+    learner, env_steps = next(saved)
+    flights = run.policies.fly(learner)
+    last = {"env_steps": env_steps, **summarise(flights)}
+    earlier = [{"env_steps": steps, **summarise(run.policies.fly(learner))} for learner, steps in saved]
+    result: dict[str, Any] = {"seed": run.config.seed + seed, "starts": len(flights.returns), **last}
+    if task:
+        success = flights.measures["success"]
+        result["failed"] = len(failures.starts(success))
+        result["failures"] = failures.listed(task, flights.observations, success, MOST_FAILURES)
+    if most > 1:
         result["checkpoints"] = [last, *earlier]
-    if asked.off_nominal:
-        result["off_nominal"] = {name: summarise(fly(there, learner)) for name, there in asked.off_nominal.items()}
+    if off := run.policies.off_nominal(learner):
+        result["off_nominal"] = {name: summarise(there) for name, there in off.items()}
     return result, flights
 
 
-def _print_checkpoints(result: dict[str, Any]) -> None:
-    columns = {f"{one['env_steps']:,}": one for one in result["checkpoints"]}
-    console.print(f"\nseed {result['seed']}, its last {len(columns)} checkpoints by environment steps")
-    _print_table("", {head: {k: v for k, v in one.items() if k != "env_steps"} for head, one in columns.items()})
+def _flown(baselines: Baselines | None, others: list[Run]) -> Flown:
+    flown = Flown({}, {}, {})
+    for name, there in (baselines.fly() if baselines else {}).items():
+        flown.flights[name] = there.pop(NOMINAL)
+        flown.baselines[name] = summarise(flown.flights[name])
+        if there:
+            flown.baselines[name]["off_nominal"] = {world: summarise(flights) for world, flights in there.items()}
+    for run in others:
+        for i, folder in enumerate(runs.members(run.folder, run.config)):
+            result, flown.flights[str(folder)] = _evaluated(run, i, 1, None)
+            flown.beside[str(folder)] = result
+    return flown
 
 
-def _print_off_nominal(result: dict[str, Any]) -> None:
-    console.print(f"\nseed {result['seed']}, step {result['env_steps']:,}")
-    nominal = {name: result[name] for name in next(iter(result["off_nominal"].values()))}
-    _print_table("", {"nominal": nominal, **result["off_nominal"]})
+def _beside(flown: Flown) -> dict[str, Any]:
+    """Their part of evaluation.json."""
+    both = {"baselines": flown.baselines, "beside": flown.beside}
+    return {name: results for name, results in both.items() if results}
 
 
-def _print_table(corner: str, columns: dict[str, dict[str, Any]]) -> None:
-    """One column for each of `columns`, one row for each number that they have."""
-    first = next(iter(columns.values()))
-    names = [name for name, x in first.items() if isinstance(x, int | float) and name not in ("seed", "starts")]
-    names = [name for name in names if not np.isnan(first[name])]
-    width = max(len(name) for name in names)
-    console.print(f"{corner:<{width}} " + " ".join(f"{head:>11}" for head in columns))
-    for name in names:
-        console.print(f"{name:<{width}} " + " ".join(f"{_cell(name, one[name]):>11}" for one in columns.values()))
+def _draw(folder: Path, task: Task, flights: Flights, flown: Flown) -> None:
+    others = {name: there.observations for name, there in flown.flights.items()}
+    with runs.writing(folder / "evaluation.png"):
+        errors.draw(folder / "evaluation.png", task, flights.observations, others)
+    if isinstance(task, QuadrotorTask):
+        with runs.writing(folder / "settle.png"):
+            settle.draw(folder / "settle.png", task, flights.observations)
 
 
-def _cell(name: str, value: float) -> str:
-    if name == "env_steps":
-        return f"{value:,}"
-    return f"{value:.2f}" if name.startswith("return") else f"{value:.4f}"
+def _print(table: list[dict[str, Any]], flown: Flown, named: dict[str, Condition]) -> None:
+    """All tables, and last which starts failed."""
+    policies = {"policy" if len(table) == 1 else f"seed {result['seed']}": result for result in table}
+    for result in table:
+        if "checkpoints" in result:
+            evaluate_table.checkpoints(result)
+    pilots = {**policies, **flown.baselines, **flown.beside}
+    evaluate_table.table(pilots)
+    if named:
+        console.print("\noff nominal:")
+        for name, condition in named.items():
+            console.print(f"  {name}: {condition.says}")
+        for name, result in pilots.items():
+            said = f"seed {result['seed']}, step {result['env_steps']:,}" if "seed" in result else ""
+            evaluate_table.off_nominal(
+                ", ".join(filter(None, (name if name not in policies else "policy", said))), result
+            )
+    for name, result in policies.items():
+        if "failures" in result:
+            evaluate_table.failures(name, result)

@@ -161,7 +161,7 @@ class Learner:
         worth, gradient = self._over_devices(jax.value_and_grad(loss)(ships))
         finite = jnp.isfinite(optax.tree.norm(gradient))
         gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
-        rate = self.hyper["apg_learning_rate"] * (1.0 - made / max(1, self.config.climbs))
+        rate = optax.cosine_decay_schedule(1.0, max(1, self.config.climbs))(made) * self.hyper["apg_learning_rate"]
         policy, optimiser, norm = self._moved(ships, gradient, optimiser, rate)
         zero = jnp.zeros(())
         state = state._replace(

@@ -181,7 +181,7 @@ def _finish(out: Path, config: RunConfig, finished: loop.Finished, seconds: floa
     """Pictures, then summary.json of each seed, then that of the whole."""
     # Only now: a second of matplotlib.
     from qrl import plots
-    from qrl_envs import picture
+    from qrl_envs.pictures import flights
 
     folders = runs.members(out, config)
     history = finished.rows
@@ -192,7 +192,7 @@ def _finish(out: Path, config: RunConfig, finished: loop.Finished, seconds: floa
         if config.task.spec:
             shown = np.asarray(finished.flights.observations[i, :PICTURE_FLIGHTS])
             with runs.writing(folder / "flight.png"):
-                picture.flights(folder / "flight.png", request.spec(config.task), shown)
+                flights.draw(folder / "flight.png", request.spec(config.task), shown)
         runs.write_json(folder / "summary.json", {"result": history[i][-1], "command_seconds": round(seconds, 1)})
     if len(folders) > 1:
         with runs.writing(out / "learning_curve.png"):

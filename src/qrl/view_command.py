@@ -12,8 +12,9 @@ from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.evaluate import Flights
 from qrl.exits import DONE
 from qrl.runs import RunConfig
+from qrl.state import point, stack
 from qrl.terminal import console
-from qrl.train import Trainer, point, stack
+from qrl.train import Trainer
 from qrl_envs import viewer
 from qrl_envs.specfile import BadInput
 from qrl_envs.viewer import Flown
