@@ -163,6 +163,12 @@ def make(one: Wanted, folder: Path) -> float:
         folder.mkdir(parents=True)
         (folder / CODE).write_text(sha256())
     begun = time.perf_counter()
+    qrl(words)
+    return time.perf_counter() - begun
+
+
+def qrl(words: list[str]) -> None:
+    """The command line in a process of its own; Failed if it fails."""
     # In a session of its own, so that Ctrl-C reaches it once: through us.
     with subprocess.Popen([sys.executable, "-m", "qrl", *words], env=environment(), start_new_session=True) as process:
         try:
@@ -172,8 +178,7 @@ def make(one: Wanted, folder: Path) -> float:
             process.wait()
             raise
     if code:
-        raise Failed(f"{folder}: qrl {' '.join(words)} ended with exit code {code}")
-    return time.perf_counter() - begun
+        raise Failed(f"qrl {' '.join(words)} ended with exit code {code}")
 
 
 def environment() -> dict[str, str]:

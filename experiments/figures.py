@@ -83,6 +83,7 @@ def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: boo
     begun = time.perf_counter()
     plan, there = wanted(fast=fast), set[str]()
     fly = functools.cache(flown)
+    note = " (FAST: shorter runs and fewer seeds than those of `make figures`)" if fast else ""
     for name in names:
         sources = [Source(run, out / "runs" / run.name) for run in needed(name, plan)]
         for run, folder in sources:
@@ -91,7 +92,7 @@ def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: boo
                 there.add(run.name)
         figure, caption = drawn(name, sources, fly)
         draw.save(figure, out / name)
-        runs.replace_text(out / f"{name}.md", captions.page(caption, Made(command, runs.commit(), sources)))
+        runs.replace_text(out / f"{name}.md", captions.page(caption, Made(command, runs.commit(), note, sources)))
         print(f"figures: {out / name}.png, .svg, .md: {caption.verdict}", flush=True)
     print(f"figures: done in {time.perf_counter() - begun:.0f} s", flush=True)
 
@@ -147,7 +148,7 @@ def rates(sources: list[Source]) -> list[Rate]:
     """Both methods' curves at each rate, the paper's first."""
     by_name = {source.run.name: source for source in sources}
     found = []
-    for whose, before in (("the paper's rates", "paper-"), ("this recipe's rates", "")):
+    for whose, before in (("the paper's learning rates", "paper-"), ("this recipe's learning rates", "")):
         for which in PAPER_RATES:
             name = f"pendulum-{before}{which}"
             if name in by_name:
