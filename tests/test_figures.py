@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 import ablation
 import figure_captions as captions
@@ -223,8 +224,8 @@ def test_every_axis_has_its_unit_and_no_letter_is_small() -> None:
             last = i == len(figure.axes) - 1
             for label in (axes.get_ylabel(), *([axes.get_xlabel()] if last else [])):
                 assert re.search(r" \[(1|%|s|m|m/s)\]$", label), label
-        texts = [text for text in figure.findobj(lambda a: hasattr(a, "get_fontsize")) if text.get_text()]
-        assert min(text.get_fontsize() for text in texts) >= 8.0
+        texts: list[Any] = figure.findobj(Text)
+        assert min(text.get_fontsize() for text in texts if text.get_text()) >= 8.0
 
 
 def test_a_figure_is_saved_as_png_and_svg(tmp_path: Path) -> None:
