@@ -60,7 +60,7 @@ def wanted(*, fast: bool) -> list[Wanted]:
         return [
             *found,
             Wanted("hover", "hover", "hover_fast", {}, seeds),
-            Wanted("circle", "circle", "circle_fast", {}, seeds),
+            Wanted("circle", "circle", "circle_fast", {"steps": 1_200_000}, seeds),
         ]
     return [
         *found,
