@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -14,6 +15,7 @@ from matplotlib.text import Text
 
 import ablation
 import figure_captions as captions
+import figure_flights
 import figure_plots as draw
 import figure_runs
 import figures
@@ -21,7 +23,10 @@ from figure_captions import CONFIRMED, EXCEEDED, NOT, Made
 from figure_flights import Flown
 from figure_plots import Curves, Rate
 from figure_runs import CODE, Wanted
-from qrl import runs
+from qrl import request, restore, runs
+from qrl.deploy import EVALUATION_STARTS_SEED
+from qrl.laps import seeds
+from qrl.train import Trainer, point, stack
 from qrl_envs import task
 
 HOVER = Wanted("hover", "hover", "hover_fast", {"steps": 320_000}, 2)
@@ -264,6 +269,31 @@ def test_flights_are_drawn_as_they_were_flown() -> None:
     np.testing.assert_allclose(line(axes, "vy")[0], [0, 2])
     assert line(axes, "vx")[79, 1] == pytest.approx(-2 * np.sin(1.58))
     assert sorted(float(y[0]) for y in (x.get_ydata() for x in axes.lines) if len(y) == 2) == [-2.0, 2.0]
+
+
+@pytest.mark.usefixtures("quick_compilation")
+def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Position and velocity are the paper's, the rest that of the first starts of `make evaluate`."""
+    small = HOVER._replace(flags={"policy_hidden": (4,), "critic_hidden": (4,)}, seeds=1)
+    folder, config = folder_of(tmp_path / "run", small), small.config()
+
+    def untrained(env: Any, *_: object) -> tuple[Trainer, Any, int]:
+        trainer = Trainer(env, config.learner)
+        return trainer, trainer.init(seeds(0, 1), stack([point(env, config.learner)])), 7
+
+    monkeypatch.setattr(restore, "last", untrained)
+    trial, nominal = (figure_flights.flown(folder, trial=trial, starts=2) for trial in (True, False))
+    for began in trial.observations[:, 0]:
+        np.testing.assert_allclose(began[9:15], [-1.58, 0.99, 1.45, -2.39, 6.20, 0.77], rtol=1e-6)
+    others = [*range(9), 15, 16, 17]
+    np.testing.assert_array_equal(trial.observations[:, 0, others], nominal.observations[:, 0, others])
+    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), 1000)  # as `qrl evaluate` has them
+    env = request.environment(config.task).evaluation().env
+    np.testing.assert_allclose(nominal.observations[:, 0], jax.vmap(env.reset)(keys[:2]).obs, rtol=1e-5, atol=1e-6)
+    assert (trial.seed, trial.env_steps, trial.observations.shape) == (0, 7, (2, 801, 18))
+    assert trial.measures["success"].shape == (2,)
 
 
 # What is told
