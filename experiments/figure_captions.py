@@ -210,8 +210,8 @@ def trial(flown: Flown) -> Caption:
         "Hover: x, y and z of the paper's trial",
         f"Position over time from [{position}] m at [{velocity}] m/s, deterministic policy of seed {flown.seed} after"
         f" {flown.env_steps:,} steps. The paper does not tell the attitude: the thick lines' is the first start's of"
-        f" `make evaluate`, as are the body rates; the thin ones' are those of the next four. In training no start is"
-        f" faster than {flown.task.start.velocity_m_s:g} m/s on any axis.",
+        f" `make evaluate`, as are the body rates; the thin ones' are those of the next four (one that flees leaves the"
+        f" window). In training no start is faster than {flown.task.start.velocity_m_s:g} m/s on any axis.",
         "From this start the vehicle comes to the origin and stays there.",
         [
             f"- The flight drawn thick {_settles(settle[0])} within {flown.task.evaluation.distance_m:g} m;"

@@ -180,7 +180,7 @@ def thousands(value: float) -> str:
 
 
 def trial(flown: Flown) -> Figure:
-    """x, y and z of the first flight over time, the others' thin behind them."""
+    """x, y and z of the first flight over time, thin behind them those of the next."""
     with style():
         figure, (axes,) = _figure(2.3)
         for i, (name, dash) in enumerate(zip("xyz", DASHES, strict=True)):
@@ -188,7 +188,11 @@ def trial(flown: Flown) -> Figure:
             for other in others:
                 axes.plot(flown.times_s, other, color=COLOURS[i], linewidth=0.7, alpha=0.35)
             axes.plot(flown.times_s, first, color=COLOURS[i], linestyle=dash, label=name, zorder=3)
-        axes.set(xlabel="time [s]", ylabel="position [m]", xlim=(0.0, flown.times_s[-1]))
+        # The thick lines whole, beneath the legend; a flight that flees leaves the window.
+        drawn = flown.observations[0, :, 9:12]
+        low, high = np.nanmin(drawn), np.nanmax(drawn)
+        limits = low - 0.2 * (high - low), high + 0.3 * (high - low)
+        axes.set(xlabel="time [s]", ylabel="position [m]", xlim=(0.0, flown.times_s[-1]), ylim=limits)
         axes.legend(loc="upper right", ncols=3)
         return figure
 
