@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export view sweep tasks bench test smoke lint torture FORCE
+.PHONY: help setup train evaluate export view sweep tasks figures ablation bench test smoke lint torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -27,6 +27,11 @@ define HELP
   make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
+  make figures                       the paper's six figures with captions, from runs that it makes and keeps
+       FAST=1                          from shorter runs of fewer seeds
+       ARGS="--only pendulum hover"    some of them; --fresh, --out FOLDER
+  make ablation                      the paper's objectives side by side on pendulum and hover, as a table
+       ARGS="--only pendulum"          one task; --fresh, --out FOLDER
   make bench                         timings beside peers, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
@@ -73,6 +78,12 @@ sweep: $(STAMP)
 
 tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)
+
+figures: $(STAMP)
+	@exec $(VENV)/bin/python experiments/figures.py $(if $(filter-out 0,$(FAST)),--fast) $(ARGS)
+
+ablation: $(STAMP)
+	@exec $(VENV)/bin/python experiments/ablation.py $(ARGS)
 
 bench: $(STAMP)
 	@exec $(VENV)/bin/python experiments/bench.py $(ARGS)
