@@ -78,7 +78,7 @@ class OffNominal(QuadrotorEnv):
         super().__init__(task)
         noise = Noise(*map(jnp.float32, condition.noise or Noise(0.0, 0.0, 0.0, 0.0)))
         flags = (jnp.bool_(flag) for flag in (condition.fine, condition.late, condition.trial))
-        self.params: Any = Conditioned(*self.params, *flags, noise)
+        self.params: Any = Conditioned(*self.params, *flags, noise)  # pyright: ignore[reportCallIssue]
 
     def step(self, state: State, action: chex.Array) -> State:
         late = state.pipeline_state.params.late

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from qrl import evaluate_table, request, restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
@@ -118,9 +119,9 @@ def _evaluated(run: Run, seed: int, most: int, task: Task | None) -> tuple[dict[
     earlier = [{"env_steps": steps, **summarise(run.policies.fly(learner))} for learner, steps in saved]
     result: dict[str, Any] = {"seed": run.config.seed + seed, "starts": len(flights.returns), **last}
     if task:
-        success = flights.measures["success"]
+        success, observations = np.asarray(flights.measures["success"]), np.asarray(flights.observations)
         result["failed"] = len(failures.starts(success))
-        result["failures"] = failures.listed(task, flights.observations, success, MOST_FAILURES)
+        result["failures"] = failures.listed(task, observations, success, MOST_FAILURES)
     if most > 1:
         result["checkpoints"] = [last, *earlier]
     if off := run.policies.off_nominal(learner):
@@ -149,12 +150,13 @@ def _beside(flown: Flown) -> dict[str, Any]:
 
 
 def _draw(folder: Path, task: Task, flights: Flights, flown: Flown) -> None:
-    others = {name: there.observations for name, there in flown.flights.items()}
+    observations = np.asarray(flights.observations)
+    others = {name: np.asarray(there.observations) for name, there in flown.flights.items()}
     with runs.writing(folder / "evaluation.png"):
-        errors.draw(folder / "evaluation.png", task, flights.observations, others)
+        errors.draw(folder / "evaluation.png", task, observations, others)
     if isinstance(task, QuadrotorTask):
         with runs.writing(folder / "settle.png"):
-            settle.draw(folder / "settle.png", task, flights.observations)
+            settle.draw(folder / "settle.png", task, observations)
 
 
 def _print(table: list[dict[str, Any]], flown: Flown, named: dict[str, Condition]) -> None:

@@ -59,7 +59,7 @@ def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Ar
             gains.velocity_1_s,
             task.control_period_s,
         )
-        force = gravity + free * jnp.minimum(1.0, most_m_s2 / jnp.maximum(_norm(free), TINY))
+        force: chex.Array = jnp.asarray(gravity) + free * jnp.minimum(1.0, most_m_s2 / jnp.maximum(_norm(free), TINY))
         return force.at[2].max(gains.falling_share * STANDARD_GRAVITY_M_S2)
 
     def control(observation: chex.Array) -> chex.Array:
@@ -76,7 +76,7 @@ def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Ar
         fed *= jnp.minimum(1.0, most / jnp.maximum(_norm(fed), TINY))
         per_rate = jnp.array([gains.rate_1_s, gains.rate_1_s, gains.heading_rate_1_s])
         spinning = per_rate * (rates + fed - rate)
-        torque = inertia_kg_m2 * spinning + jnp.cross(rate, inertia_kg_m2 * rate)
+        torque: chex.Array = jnp.asarray(inertia_kg_m2) * spinning + jnp.cross(rate, inertia_kg_m2 * rate)
         return action(
             motors, vehicle.mass_kg * (lift - STANDARD_GRAVITY_M_S2), torque, gains.leeway_share * motors.lift_N
         )
@@ -137,7 +137,7 @@ def _upright(direction: chex.Array) -> chex.Array:
     return jnp.array([[1.0 - k * x * x, -k * x * y, x], [-k * x * y, 1.0 - k * y * y, y], [-x, -y, z]])
 
 
-def _speed_per_distance(distance: chex.Array, bandwidth: float, braking: float) -> chex.Array:
+def _speed_per_distance(distance: chex.Array, bandwidth: float, braking: chex.Array | float) -> chex.Array:
     """Speed per distance: the bandwidth near the target, and as much as `braking` still stops farther away."""
     near = braking / bandwidth**2
     far = jnp.maximum(distance, near)

@@ -27,6 +27,8 @@ from qrl_envs import quadrotor, rotation
 from qrl_envs.quadrotor import Body, Pose, Twist
 from qrl_envs.task import STANDARD_GRAVITY_M_S2, CircleReward, HoverReward, QuadrotorTask
 
+Array = chex.Array | np.ndarray
+
 NEWTON_STEPS = 8
 ERRORS = 12
 ALONG = 1  # of an error's parts that along the circle, which is left out
@@ -35,11 +37,11 @@ ALONG = 1  # of an error's parts that along the circle, which is left out
 class Wanted(NamedTuple):
     """The motion to regulate about, as it stands still in its frame."""
 
-    position_m: chex.Array  # [3]
-    velocity_m_s: chex.Array  # [3]
-    attitude: chex.Array  # [4] quaternion, body -> frame
-    body_rate_rad_s: chex.Array  # [3]
-    action: chex.Array  # [4]
+    position_m: Array  # [3]
+    velocity_m_s: Array  # [3]
+    attitude: Array  # [4] quaternion, body -> frame
+    body_rate_rad_s: Array  # [3]
+    action: Array  # [4]
 
 
 class Linear(NamedTuple):
@@ -59,7 +61,7 @@ def controller(task: QuadrotorTask) -> Callable[[chex.Array], chex.Array]:
     return following(motion.wanted, gain(motion, *weights(task)).astype(np.float32))
 
 
-def following(wanted: Wanted, gain: chex.Array) -> Callable[[chex.Array], chex.Array]:
+def following(wanted: Wanted, gain: np.ndarray) -> Callable[[chex.Array], chex.Array]:
     """The controller wanted.action − gain · error, with a gain [4, 12] or, on the circle, [4, 11]."""
     circling = gain.shape[1] < ERRORS
 
@@ -119,12 +121,12 @@ def linearised(task: QuadrotorTask) -> Linear:
     parts = np.arange(ERRORS + 4)
     # What may give way: all but the place, speed along the circle, and heading; or the thrusts alone.
     free = ~np.isin(parts, [0, 1, 2, 4]) if circling else parts >= ERRORS
-    wanted, change = _turning(task), np.zeros(len(parts))
+    kept = parts[:ERRORS] != ALONG if circling else parts[:ERRORS] >= 0
+    wanted, change, by = _turning(task), np.zeros(len(parts)), np.zeros((ERRORS, len(parts)))
     for _ in range(NEWTON_STEPS):
         wanted, off, by = look(wanted, change.astype(np.float32))
         by = np.asarray(by, np.float64)
         steady = by - np.eye(ERRORS, len(parts))  # what of a change is not there before the step too
-        kept = parts[:ERRORS] != ALONG if circling else parts[:ERRORS] >= 0
         change = np.zeros(len(parts))
         change[free] = -np.linalg.lstsq(steady[kept][:, free], np.asarray(off, np.float64)[kept], rcond=1e-5)[0]
     return Linear(wanted, by[kept][:, :ERRORS][:, kept], by[kept][:, ERRORS:])
@@ -158,7 +160,7 @@ def _moved(wanted: Wanted, by: chex.Array) -> tuple[Body, chex.Array]:
     position, velocity, turn, rate = jnp.split(by[:ERRORS], 4)
     small = rotation.normalise(jnp.concatenate([jnp.ones(1), turn / 2.0]))
     body = Body(
-        Pose(wanted.position_m + position, rotation.product(wanted.attitude, small)),
+        Pose(jnp.asarray(wanted.position_m) + position, rotation.product(wanted.attitude, small)),
         Twist(wanted.velocity_m_s + velocity, wanted.body_rate_rad_s + rate),
     )
     return body, wanted.action + by[ERRORS:]

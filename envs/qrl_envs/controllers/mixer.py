@@ -70,7 +70,7 @@ def action(mixer: Mixer, lift_N: chex.Array, torque_N_m: chex.Array, leeway_N: f
     return jnp.clip((thrust + yaw) / mixer.action_scale_N, -1.0, 1.0)
 
 
-def _share(needs: chex.Array, has: chex.Array) -> chex.Array:
+def _share(needs: chex.Array, has: chex.Array | np.ndarray) -> chex.Array:
     """How much of `needs` can be had, in (0, 1], if all are to be cut alike; []."""
     short = needs > has
     return jnp.min(jnp.where(short, has / jnp.where(short, needs, 1.0), 1.0))

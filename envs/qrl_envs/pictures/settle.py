@@ -93,8 +93,8 @@ def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> No
         never = np.isinf(cells[i, j])
         dark = not never and cells[i, j] < (low + high) / 2
         axes.text(
-            (TILT_EDGES_DEG[j] + TILT_EDGES_DEG[j + 1]) / 2,
-            (edges[i] + edges[i + 1]) / 2,
+            float(TILT_EDGES_DEG[j] + TILT_EDGES_DEG[j + 1]) / 2,
+            float(edges[i] + edges[i + 1]) / 2,
             "never" if never else f"{cells[i, j]:.2g}" if cells[i, j] < 10 else f"{cells[i, j]:.0f}",
             ha="center",
             va="center",
