@@ -8,7 +8,8 @@ import numpy as np
 
 from qrl import request, restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
-from qrl.train import Trainer, point, stack
+from qrl.state import point, stack
+from qrl.train import Trainer
 from qrl_envs.conditions import OffNominal, conditions
 from qrl_envs.task import QuadrotorTask
 

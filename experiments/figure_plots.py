@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from figure_flights import Flown
-from qrl_envs.picture import COLOURS, INK
+from qrl_envs.pictures.frame import COLOURS, INK
 from qrl_envs.task import CircleReward
 
 WIDTH_IN = 3.4  # a column

@@ -23,6 +23,7 @@ CODE = "code.sha256"  # in a run's folder: of which code it is
 SEEDS, FAST_SEEDS = 6, 4  # even, so that two cores share them
 PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
 PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
+METHOD = {"apg_fraction": 0.0}  # the paper's to the end, without what our presets add
 RATIO = PAPER_RATES["high"] / PAPER_RATES["low"]
 
 
@@ -59,15 +60,15 @@ def wanted(*, fast: bool) -> list[Wanted]:
     if fast:
         return [
             *found,
-            Wanted("hover", "hover", "hover_fast", {}, seeds),
-            Wanted("circle", "circle", "circle_fast", {"steps": 1_200_000}, seeds),
+            Wanted("hover", "hover", "hover_fast", METHOD, seeds),
+            Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 1_200_000}, seeds),
         ]
     return [
         *found,
-        Wanted("hover", "hover", "hover", {"steps": 1_500_000}, seeds),
-        Wanted("circle", "circle", "circle_fast", {}, seeds),
-        Wanted("hover-flight", "hover", "hover", {}),
-        Wanted("circle-flight", "circle", "circle", {}),
+        Wanted("hover", "hover", "hover", METHOD | {"steps": 1_500_000, "reports": 25}, seeds),
+        Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 1_800_000}, seeds),
+        Wanted("hover-flight", "hover", "hover", METHOD | {"steps": 4_500_000}),
+        Wanted("circle-flight", "circle", "circle", METHOD | {"steps": 4_500_000}),
     ]
 
 

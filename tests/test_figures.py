@@ -26,7 +26,8 @@ from figure_runs import CODE, Wanted
 from qrl import request, restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.laps import seeds
-from qrl.train import Trainer, point, stack
+from qrl.state import point, stack
+from qrl.train import Trainer
 from qrl_envs import task
 
 HOVER = Wanted("hover", "hover", "hover_fast", {"steps": 320_000}, 2)
@@ -116,7 +117,7 @@ def test_a_run_of_other_code_or_a_damaged_one_is_not_current(tmp_path: Path) -> 
 def test_the_code_of_a_run_is_what_decides_its_numbers() -> None:
     found = figure_runs.sources()
     assert {"qrl.learner", "qrl.vtrace", "qrl.objective", "qrl.evaluate", "qrl_envs.quadrotor"} <= found.keys()
-    assert not {"qrl.plots", "qrl.cli", "qrl.sweep", "qrl_envs.picture"} & found.keys()
+    assert not {"qrl.plots", "qrl.cli", "qrl.sweep", "qrl_envs.pictures"} & found.keys()
 
 
 def test_an_unfinished_run_goes_on_and_a_stale_one_is_made_again(
