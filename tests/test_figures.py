@@ -291,7 +291,8 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     others = [*range(9), 15, 16, 17]
     np.testing.assert_array_equal(trial.observations[:, 0, others], nominal.observations[:, 0, others])
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), 1000)  # as `qrl evaluate` has them
-    env = request.environment(config.task).evaluation().env
+    task_env: Any = request.environment(config.task)
+    env = task_env.evaluation().env
     np.testing.assert_allclose(nominal.observations[:, 0], jax.vmap(env.reset)(keys[:2]).obs, rtol=1e-5, atol=1e-6)
     assert (trial.seed, trial.env_steps, trial.observations.shape) == (0, 7, (2, 801, 18))
     assert trial.measures["success"].shape == (2,)

@@ -80,7 +80,7 @@ class Config(BaseModel):
     )
     apg_lanes: Static[Count] = Field(description="flights of one such update")
     apg_steps: Static[Count] = Field(description="steps of such a flight")
-    apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; to 0 along a cosine")
+    apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; this and sigma fall to 0")
 
     gamma: Traced[Fraction] = Field(description="discount")
     lam: Traced[Fraction] = Field(description="lambda of the trace; 1 in the paper")

@@ -144,6 +144,10 @@ class Learner:
         )
         return self._averaged(state), terms._replace(policy_gradient=policy_norm, value_gradient=critic_norm)
 
+    def left(self, made: chex.Array) -> chex.Array:
+        """Falls from 1 to 0 over the updates by the analytic gradient, with how many were made: step size and noise."""
+        return 1.0 - made / max(1, self.config.climbs)
+
     def climb(
         self, state: LearnerState, returns: Callable[[LearnerState], chex.Array], made: chex.Array
     ) -> tuple[LearnerState, Terms]:
@@ -161,7 +165,7 @@ class Learner:
         worth, gradient = self._over_devices(jax.value_and_grad(loss)(ships))
         finite = jnp.isfinite(optax.tree.norm(gradient))
         gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
-        rate = optax.cosine_decay_schedule(1.0, max(1, self.config.climbs))(made) * self.hyper["apg_learning_rate"]
+        rate = self.left(made) * self.hyper["apg_learning_rate"]
         policy, optimiser, norm = self._moved(ships, gradient, optimiser, rate)
         zero = jnp.zeros(())
         state = state._replace(

@@ -193,7 +193,8 @@ class Trainer:
             keys = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(lanes)
 
             def returns(now: LearnerState) -> chex.Array:
-                return apg.returns(env, lambda o: learner.mean(now, o), learner.sigma(now), keys, config.apg_steps)
+                noise = learner.sigma(now) * learner.left(i)
+                return apg.returns(env, lambda o: learner.mean(now, o), noise, keys, config.apg_steps)
 
             now, terms = learner.climb(state.learner, returns, i)
             flown = config.apg_lanes * config.apg_steps

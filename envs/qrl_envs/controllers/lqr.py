@@ -15,7 +15,7 @@ It is linear: far from the wanted motion it promises nothing.
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -27,7 +27,7 @@ from qrl_envs import quadrotor, rotation
 from qrl_envs.quadrotor import Body, Pose, Twist
 from qrl_envs.task import STANDARD_GRAVITY_M_S2, CircleReward, HoverReward, QuadrotorTask
 
-Array = chex.Array | np.ndarray
+Array = Any  # NumPy's where the gain is found, JAX's where it acts
 
 NEWTON_STEPS = 8
 ERRORS = 12
