@@ -5,7 +5,7 @@ Every number here is computed from the runs. The rule of each verdict is in its 
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from figure_flights import Flown
 from figure_plots import PUBLISHED, Curves, Rate, thousands
 from figure_runs import PAPER_RATES, Wanted
 from qrl import request
+from qrl.runs import RunConfig
 from qrl_envs.conditions import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
 from qrl_envs.task import CircleReward
 
@@ -45,7 +46,9 @@ class Made(NamedTuple):
 def page(caption: Caption, made: Made) -> str:
     """The caption as Markdown."""
     configs = {one.name: request.stored(folder) for one, folder in made.runs}
-    commands = [f"- `{one.name}`: `qrl {' '.join(one.words)}`, {_seeds(configs[one.name])}" for one, _ in made.runs]
+    commands = [
+        f"- `{one.name}`: `{_command(one, configs[one.name])}`, {_seeds(configs[one.name])}" for one, _ in made.runs
+    ]
     versions = {tuple(config.versions.items()) for config in configs.values()}
     said = [", ".join(f"{name} {version}" for name, version in one) for one in sorted(versions)]
     return "\n".join(
@@ -74,7 +77,13 @@ def page(caption: Caption, made: Made) -> str:
     )
 
 
-def _seeds(config: Any) -> str:
+def _command(one: Wanted, config: RunConfig) -> str:
+    """As it was run: results agree only to rounding on another number of devices."""
+    cpus = len(config.devices) if all("cpu" in device.lower() for device in config.devices) else 0
+    return f"{f'JAX_NUM_CPU_DEVICES={cpus} ' if cpus > 1 else ''}qrl {' '.join(one.words)}"
+
+
+def _seeds(config: RunConfig) -> str:
     return f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed}–{config.seed + config.seeds - 1}"
 
 

@@ -23,11 +23,12 @@ from figure_captions import CONFIRMED, EXCEEDED, NOT, Made
 from figure_flights import Flown
 from figure_plots import Curves, Rate
 from figure_runs import CODE, Wanted
-from qrl import request, restore, runs
+from qrl import restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.laps import seeds
 from qrl.state import point, stack
 from qrl.train import Trainer
+from qrl_envs import env as worlds
 from qrl_envs import task
 
 HOVER = Wanted("hover", "hover", "hover_fast", {"steps": 320_000}, 2)
@@ -291,8 +292,7 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     others = [*range(9), 15, 16, 17]
     np.testing.assert_array_equal(trial.observations[:, 0, others], nominal.observations[:, 0, others])
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), 1000)  # as `qrl evaluate` has them
-    task_env: Any = request.environment(config.task)
-    env = task_env.evaluation().env
+    env = worlds.make("hover").evaluation().env
     np.testing.assert_allclose(nominal.observations[:, 0], jax.vmap(env.reset)(keys[:2]).obs, rtol=1e-5, atol=1e-6)
     assert (trial.seed, trial.env_steps, trial.observations.shape) == (0, 7, (2, 801, 18))
     assert trial.measures["success"].shape == (2,)
@@ -316,6 +316,10 @@ def test_a_caption_says_how_it_was_made_and_its_numbers_are_the_runs(tmp_path: P
     assert "- `hover`: `qrl train hover --seeds 2 --preset hover_fast --steps 320000`, seeds 0–1" in page
     for name, version in runs.versions().items():
         assert f"{name} {version}" in page
+    devices = [f"TFRT_CPU_{i}" for i in range(2)]
+    runs.write_json(folder / "config.json", HOVER.config().model_dump(mode="json") | {"devices": devices})
+    page = captions.page(caption, Made("make figures", "abc123", "", [(HOVER, folder)]))
+    assert "`JAX_NUM_CPU_DEVICES=2 qrl train hover --seeds 2" in page
 
 
 def test_hover_is_held_against_ten_million_steps() -> None:

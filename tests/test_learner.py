@@ -186,9 +186,10 @@ def traced() -> tuple[Hyper, object]:
     state = learner.init(jax.random.PRNGKey(1))._replace(updates=jnp.int32(learner.total_updates // 2))
 
     @jax.jit
-    def decided(values: Hyper) -> tuple[LearnerState, Terms, jax.Array]:
+    def decided(values: Hyper) -> tuple[LearnerState, Terms, jax.Array, LearnerState]:
         other = learner.under(values)
-        return *other.update(state, data), other.sigma(state)
+        climbed, _ = other.climb(state, lambda now: other.mean(now, data.observation).sum(axis=(1, 2)), jnp.int32(0))
+        return *other.update(state, data), other.sigma(state), climbed
 
     return hyper(here), decided
 

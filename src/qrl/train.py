@@ -48,8 +48,7 @@ class Trainer:
         self.learner = Learner(config, *sizes, SHARD if mesh else None)
         init = self._over_mesh(self._init_all, (P(MEMBER), P(MEMBER)), LAYOUT)
         advance, climb = (
-            self._over_mesh(functools.partial(self._go_on_all, one), (LAYOUT, P(MEMBER), P()), LAYOUT)
-            for one in (self._advance, self._climb)
+            self._over_mesh(every, (LAYOUT, P(MEMBER), P()), LAYOUT) for every in (self._advance_all, self._climb_all)
         )
         self.init = jax.jit(init, compiler_options=xla_effort(0))  # it runs once
         self.advance = jax.jit(advance, donate_argnums=0, compiler_options=xla_effort(1))
@@ -112,7 +111,13 @@ class Trainer:
     def _init_all(self, seeds: chex.Array, points: Point) -> TrainState:
         return _over_members(lambda m: self._init(m[0], m[1]), (seeds, points))
 
-    def _go_on_all(
+    def _advance_all(self, states: TrainState, points: Point, until: chex.Array) -> TrainState:
+        return self._go_on(self._advance, states, points, until)
+
+    def _climb_all(self, states: TrainState, points: Point, until: chex.Array) -> TrainState:
+        return self._go_on(self._climb, states, points, until)
+
+    def _go_on(
         self,
         one: Callable[[TrainState, Point, chex.Array], TrainState],
         states: TrainState,
