@@ -18,7 +18,7 @@ define HELP
        OUT=runs/circle                 the run folder
        RESUME=1                        go on where that run stopped
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
-       ARGS="--steps 2e6"              any other flag of `qrl train`; `qrl train --help` lists them
+       ARGS="--gamma 0.97"             any other flag of `qrl train`; `qrl train --help` lists them
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
        ARGS=--off-nominal              any flag of `qrl evaluate`; "--beside runs/ppo": other runs too
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit

@@ -116,8 +116,8 @@ def pendulum(rates: list[Rate]) -> Caption:
     return Caption(
         "Pendulum: learning curves at two learning rates, against PPO",
         f"Return of 200 steps over environment steps: median and interquartile range of {first.seeds} seeds,"
-        f" {thousands(first.steps[-1])} steps each. Ours is the paper's method, on- and off-policy; PPO the same"
-        " learner with a ring of one unroll and GAE(0.95)."
+        f" {thousands(first.steps[-1])} steps each. Ours is the paper's method, on- and off-policy, on trajectories"
+        " turned by the task's symmetries; PPO the same learner with a ring of one unroll and GAE(0.95)."
         f" The paper's learning rates are {high:g} and {low:g}, held constant here; this recipe's are what its preset"
         f" says (with its schedule), and the same divided by {high / low:g}, the ratio between the paper's two.",
         "At both of its learning rates the combined method does slightly better than a minimally tuned PPO.",

@@ -23,7 +23,7 @@ CODE = "code.sha256"  # in a run's folder: of which code it is
 SEEDS, FAST_SEEDS = 6, 4  # even, so that two cores share them
 PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
 PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
-METHOD = {"apg_fraction": 0.0}  # the paper's to the end, without what our presets add
+METHOD = {"apg_fraction": 0.0}  # the paper's method to the end, on trajectories that symmetries turn
 RATIO = PAPER_RATES["high"] / PAPER_RATES["low"]
 
 

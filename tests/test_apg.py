@@ -12,12 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from qrl import apg, laps, loop, runs
+from qrl import apg, laps, request, restore, runs
 from qrl.config import Config
 from qrl.learner import Learner, LearnerState
 from qrl.state import point, stack
 from qrl.train import Trainer
 from qrl_envs import env as worlds
+from qrl_envs.specfile import BadInput
 from test_loop import assert_same, last_state, metrics, run_config, train
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
@@ -84,8 +85,9 @@ def test_returns_are_those_of_flights_step_by_step() -> None:
     env, gain = Pushed(edge=1.5), np.array([-0.5, 0.3], np.float32)
     expected = literal(env, gain, 0.3, KEYS, 8)
     assert 0 < (expected == 0.0).sum() < len(KEYS)
-    found = apg.returns(env, linear(jnp.asarray(gain)), jnp.float32(0.3), KEYS, 8)
+    found, whole = apg.returns(env, linear(jnp.asarray(gain)), jnp.float32(0.3), KEYS, 8)
     np.testing.assert_allclose(found, expected, rtol=1e-5)
+    np.testing.assert_array_equal(whole, expected != 0.0)
 
 
 def test_the_gradient_is_that_of_finite_differences() -> None:
@@ -93,7 +95,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
     env, gain, sigma = Pushed(edge=1.5), np.array([-0.3, 0.4]), 0.1
 
     def mean_return(gain: jax.Array) -> jax.Array:
-        return jnp.mean(apg.returns(env, linear(gain), jnp.float32(sigma), KEYS, 8))
+        return jnp.mean(apg.returns(env, linear(gain), jnp.float32(sigma), KEYS, 8)[0])
 
     step = 1e-2
     expected = [
@@ -123,14 +125,16 @@ def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
     env, ours = Pushed(), learner(apg_learning_rate=0.01)
     keys = jax.random.split(jax.random.PRNGKey(0), 32)
 
-    def returns(now: LearnerState) -> jax.Array:
+    def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
         return apg.returns(env, lambda o: ours.mean(now, o), jnp.float32(0.0), keys, 20)
 
-    climb = jax.jit(lambda now, i: ours.climb(now, returns, i))
+    climb = jax.jit(lambda now, i: ours.climb(now, flown, i))
     state = first = ours.init(jax.random.PRNGKey(1))
-    for i in range(30):
-        state, _ = climb(state, i)
-    assert float(jnp.mean(returns(state))) > 0.5 * float(jnp.mean(returns(first)))  # both below 0
+    for i in range(29):
+        state, _, _ = climb(state, i)
+    state, _, sums = climb(state, 29)
+    assert float(jnp.mean(flown(state)[0])) > 0.5 * float(jnp.mean(flown(first)[0]))  # both below 0
+    assert sums[1] == ours.config.apg_lanes
     assert state.updates == 30
     jax.tree.map(np.testing.assert_array_equal, state.params.critic, first.params.critic)
     jax.tree.map(np.testing.assert_array_equal, state.optimiser.critic, first.optimiser.critic)
@@ -147,14 +151,14 @@ def test_the_first_climb_begins_with_what_ships_and_a_fresh_optimiser() -> None:
         optimiser=state.optimiser._replace(policy=seen), average=average, updates=jnp.int32(ours.total_updates)
     )
 
-    def returns(now: LearnerState) -> jax.Array:
-        return sum(jnp.sum(3.0 * x) for x in jax.tree.leaves(now.params.policy))[None]
+    def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
+        return sum(jnp.sum(3.0 * x) for x in jax.tree.leaves(now.params.policy))[None], jnp.ones(1)
 
-    after, terms = ours.climb(state, returns, jnp.int32(0))
+    after, terms, _ = ours.climb(state, flown, jnp.int32(0))
     ships = policy_of(state._replace(params=state.params._replace(policy=average)))
     np.testing.assert_allclose(policy_of(after) - ships, ours.config.apg_learning_rate, rtol=1e-3)
     np.testing.assert_allclose(terms.policy_gradient, 3.0 * np.sqrt(len(ships)), rtol=1e-5)
-    last, _ = ours.climb(after, returns, jnp.int32(ours.config.climbs - 1))
+    last, _, _ = ours.climb(after, flown, jnp.int32(ours.config.climbs - 1))
     moved = np.abs(policy_of(last) - policy_of(after)).max()
     assert 0 < moved < 3.0 * ours.config.apg_learning_rate / ours.config.climbs
 
@@ -163,11 +167,15 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
     ours = learner()
     state = ours.init(jax.random.PRNGKey(1))
 
-    def returns(now: LearnerState) -> jax.Array:
-        return jnp.stack([jnp.sum(jnp.sqrt(x - x)) for x in jax.tree.leaves(now.params.policy)])  # slope: infinite
+    def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
+        slopes = [jnp.sum(jnp.sqrt(x - x)) for x in jax.tree.leaves(now.params.policy)]  # infinite
+        return jnp.stack(slopes), jnp.ones(1)
 
-    after, _ = ours.climb(state, returns, jnp.int32(0))
+    state = state._replace(optimiser=jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimiser))  # a momentum
+    after, terms, _ = ours.climb(state, flown, jnp.int32(1))
     np.testing.assert_array_equal(policy_of(after), policy_of(state))
+    jax.tree.map(np.testing.assert_array_equal, after.optimiser, state.optimiser)
+    assert terms.policy_gradient == 0.0
 
 
 @given(
@@ -215,16 +223,71 @@ def test_a_run_ends_with_its_climbs(whole: Path) -> None:
     run = run_config(**CLIMBING).learner
     assert (run.learning_unrolls, run.climbs) == (18, 6)
     rows = runs.read_metrics(whole)
-    assert [row["env_steps"] for row in rows] == [200, 400, 600, 800, 1000, 1200]
-    assert [row["updates"] for row in rows[-3:]] == [34 + 1, 34 + 3, 34 + 6]
+    assert [row["env_steps"] for row in rows] == [200, 400, 600, 800, 1040, 1200]  # not within a climb
+    assert [row["updates"] for row in rows[-3:]] == [34 + 1, 34 + 4, 34 + 6]
     assert rows[-1]["value_loss"] == 0.0 < rows[-1]["policy_gradient"]
 
 
-@pytest.mark.parametrize("stop_after", [21, 24])
+def test_reports_among_the_climbs_wait_for_one(tmp_path: Path) -> None:
+    """Asked for oftener than there are climbs: no row is without numbers, and none without a climb."""
+    train(tmp_path, run_config(**CLIMBING, reports=30), worlds.make("pendulum"))
+    rows = runs.read_metrics(tmp_path)
+    assert [row["env_steps"] for row in rows] == [*range(40, 721, 40), *range(800, 1201, 80)]
+    assert all(np.isfinite([row["reward_mean"], row["steps_per_second"]]).all() for row in rows)
+    assert [row["updates"] for row in rows[-6:]] == [34 + i for i in range(1, 7)]
+
+
+class Fleeing(Pushed):
+    """Every flight ends at once."""
+
+    def __init__(self) -> None:
+        super().__init__(edge=0.0)
+
+
+def test_flights_that_end_early_are_counted(tmp_path: Path) -> None:
+    """And are no part of the mean reward, which would be at its best."""
+    train(tmp_path, run_config(**CLIMBING), Fleeing())
+    assert [row["ended_early"] for row in runs.read_metrics(tmp_path)[-2:]] == [1.0, 1.0]
+
+
+class Nowhere(Pushed):
+    """Its rewards are not numbers once it is flown for a while."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return super().step(state, action).replace(reward=jnp.where(jnp.abs(state.obs[0]) > 0.0, jnp.nan, 0.0))
+
+
+def test_rewards_that_are_no_numbers_stop_the_climbs() -> None:
+    """The fault is the run's, as it is while it learns."""
+    config = run_config(**CLIMBING).learner
+    trainer, points = Trainer(Nowhere(), config), stack([point(Nowhere(), config)])
+    states = trainer.init(laps.seeds(0, 1), points)
+    states = states._replace(unrolls=jnp.full(1, config.learning_unrolls, jnp.int32))
+    after = trainer.climb(states, points, np.int32(config.unrolls))
+    assert (after.fault_update, after.fault_term) == (0, 0)
+
+
+class Looping(Pushed):
+    """Its step cannot be differentiated."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        pushed = jax.lax.while_loop(lambda a: jnp.abs(a[0]) > 1.0, lambda a: a / 2.0, action)
+        return super().step(state, pushed)
+
+
+def test_an_environment_without_a_gradient_is_told_before_training() -> None:
+    """One line that names the key; without climbs it is welcome."""
+    with pytest.raises(BadInput, match="inverted: key 'apg_fraction': expected 0"):
+        request.check(Looping(), run_config(**CLIMBING).learner, "inverted")
+    request.check(Looping(), run_config().learner, "inverted")
+    request.check(Pushed(), run_config(**CLIMBING).learner, "inverted")
+
+
+@pytest.mark.parametrize("stop_after", [21, 22])
 def test_stopped_among_the_climbs_it_goes_on_to_the_same_bits(tmp_path: Path, whole: Path, stop_after: int) -> None:
     env, run = worlds.make("pendulum"), run_config(**CLIMBING)
-    events = train(tmp_path, run, env, stop_after=stop_after)
-    reached = max(e.env_steps for e in events if isinstance(e, loop.Progress))
+    train(tmp_path, run, env, stop_after=stop_after)
+    _, _, reached = restore.last(env, run, tmp_path)
     assert 720 < reached < 1200
     train(tmp_path, run, env, resume=True)
     assert_same(last_state(tmp_path, run, env), last_state(whole, run, env))

@@ -188,7 +188,9 @@ def traced() -> tuple[Hyper, object]:
     @jax.jit
     def decided(values: Hyper) -> tuple[LearnerState, Terms, jax.Array, LearnerState]:
         other = learner.under(values)
-        climbed, _ = other.climb(state, lambda now: other.mean(now, data.observation).sum(axis=(1, 2)), jnp.int32(0))
+        climbed, *_ = other.climb(
+            state, lambda now: (other.mean(now, data.observation).sum(axis=(1, 2)), jnp.ones(B)), jnp.int32(0)
+        )
         return *other.update(state, data), other.sigma(state), climbed
 
     return hyper(here), decided

@@ -20,11 +20,11 @@ def returns(
     sigma: chex.Array,
     keys: chex.PRNGKey,
     steps: int,
-) -> chex.Array:
-    """The sum of rewards over `steps` of a flight from a fresh start, for each of `keys` [n]: [n].
+) -> tuple[chex.Array, chex.Array]:
+    """For each of `keys` [n] a flight of `steps` from a fresh start: the sum of its rewards, and whether it is whole.
 
-    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early counts 0, with no gradient: where
-    rewards are below 0, it would pay to end.
+    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not whole; its sum is 0,
+    without a gradient: where rewards are below 0, it would pay to end.
     """
 
     def one(key: chex.PRNGKey) -> tuple[State, chex.Array]:
@@ -40,4 +40,4 @@ def returns(
     # Each step once more on the way back: its intermediate values, of all steps, would not stay in a CPU's cache.
     first = states, jnp.ones_like(states.reward)
     (_, whole), rewards = jax.lax.scan(jax.checkpoint(step), first, jnp.swapaxes(noise, 0, 1))
-    return jnp.where(whole > 0, jnp.sum(rewards, axis=0), 0.0)
+    return jnp.where(whole > 0, jnp.sum(rewards, axis=0), 0.0), whole > 0

@@ -65,13 +65,13 @@ class Config(BaseModel):
     )
     reward_scale: Traced[Positive] = Field(description="factor on rewards, so that |V| is about 1")
 
-    learning_rate: Traced[Positive] = Field(description="Adam's step size at the start")
-    learning_rate_end: Traced[NonNegative] = Field(description="and at the end, linear in between")
+    learning_rate: Traced[Positive] = Field(description="Adam's step size at the start of learning")
+    learning_rate_end: Traced[NonNegative] = Field(description="and at its end, linear in between")
     gradient_clip: Traced[Positive] = Field(description="global norm at which each network's gradient is clipped")
     sigma: Traced[Positive] = Field(description="the policy's standard deviation at the start")
-    sigma_end: Traced[Positive] = Field(description="and at the end, log-linear in between")
+    sigma_end: Traced[Positive] = Field(description="and at the end of learning, log-linear in between")
     average_fraction: Static[Fraction] = Field(
-        description="last part of the run over which the policy that ships is averaged; 0: not averaged"
+        description="last part of learning over which the policy that ships is averaged; 0: not averaged"
     )
 
     apg_fraction: Static[Fraction] = Field(
@@ -79,7 +79,7 @@ class Config(BaseModel):
         " environment itself (analytic policy gradient); 0: none"
     )
     apg_lanes: Static[Count] = Field(description="flights of one such update")
-    apg_steps: Static[Count] = Field(description="steps of such a flight")
+    apg_steps: Static[Count] = Field(description="steps of each")
     apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; this and sigma fall to 0")
 
     gamma: Traced[Fraction] = Field(description="discount")
@@ -157,6 +157,11 @@ class Config(BaseModel):
         replayed = self.updates_per_unroll * self.minibatch_lanes / self.lanes
         learning = min(last, self.learning_unrolls) - min(first, self.learning_unrolls)
         return self.unroll_size * ((last - first) + replayed * learning)
+
+    def whole(self, unrolls: int) -> int:
+        """`unrolls`, or where it lies among the climbs, the end of the climb in which it lies."""
+        into = max(0, unrolls - self.learning_unrolls)
+        return unrolls + -into % self.unrolls_per_climb if into else unrolls
 
     @property
     def unrolls_per_report(self) -> int:

@@ -31,6 +31,7 @@ from qrl_envs import ports
 from qrl_envs.specfile import BadInput
 
 EVALUATION_STARTS_SEED = 1_000_003  # other starts than the reports'
+STARTS = 1000  # that `qrl evaluate` flies; a start's index is its place among them
 CALIBRATION_STARTS_SEED = 7_000_003  # and others again
 CALIBRATION_STARTS = 1000
 ENVELOPE = 0.2  # of them that are the envelope's, not the task's own

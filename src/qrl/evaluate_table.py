@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+from qrl.deploy import STARTS
 from qrl.terminal import console
 
 APART = ("seed", "starts", "failed")  # numbers that are no measure of a flight
@@ -44,7 +45,8 @@ def failures(who: str, result: dict[str, Any]) -> None:
         return
     first = " ".join(str(each["start"]) for each in listed[:NAMED])
     more = " …" if result["failed"] > NAMED else ""
-    console.print(f": {first}{more} (qrl view RUN --starts {first.split()[0]} replays one)")
+    replay = f" (qrl view RUN --starts {first.split()[0]} replays one)" if listed[0]["start"] < STARTS else ""
+    console.print(f": {first}{more}{replay}")
 
 
 def _cell(name: str, one: dict[str, Any]) -> str:

@@ -98,9 +98,10 @@ def laps(
     began = time.perf_counter()
     chunk = 1
     while done < config.unrolls and not hear(stopped()).any():
-        report_at = min(config.unrolls, (done // config.unrolls_per_report + 1) * config.unrolls_per_report)
+        due = (done // config.unrolls_per_report + 1) * config.unrolls_per_report
+        report_at = config.whole(min(config.unrolls, due))
         learning = done < config.learning_unrolls
-        until = min(report_at, done + chunk, config.learning_unrolls if learning else config.unrolls)
+        until = min(report_at, config.learning_unrolls if learning else config.unrolls, config.whole(done + chunk))
         advance = programs.advance if learning else programs.climb()
         started = time.perf_counter()
         states = jax.block_until_ready(advance(states, points, np.int32(until)))
@@ -142,7 +143,7 @@ def _rows(
                 **{name: summary.pop(name) for name in ("return_mean", "return_min", "success")},
                 "train_seconds": round(clock.train_seconds, 3),
                 **summary,
-                "reward_mean": float(totals.rewards[i] / totals.steps[i]),
+                "reward_mean": float(totals.rewards[i] / max(float(totals.steps[i]), 1.0)),
                 "ended_early": float(totals.early[i] / max(float(totals.episodes[i]), 1.0)),
                 **{name: float(value[i]) / count for name, value in totals.terms._asdict().items()},
                 "steps_per_second": round(float(totals.steps.sum()) / clock.report_seconds, 1),

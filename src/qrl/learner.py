@@ -149,24 +149,31 @@ class Learner:
         return 1.0 - made / max(1, self.config.climbs)
 
     def climb(
-        self, state: LearnerState, returns: Callable[[LearnerState], chex.Array], made: chex.Array
-    ) -> tuple[LearnerState, Terms]:
-        """One step of the policy up the mean of `returns` [n], differentiable in the learner's policy.
+        self,
+        state: LearnerState,
+        flown: Callable[[LearnerState], tuple[chex.Array, chex.Array]],
+        made: chex.Array,
+    ) -> tuple[LearnerState, Terms, chex.Array]:
+        """One step up the mean return; also the sums of returns and of whole flights, over all devices [2].
 
-        `made`: int32 [], how many such steps were made before. The first begins with the policy that ships and an
-        optimiser that has seen nothing. A gradient that is not finite is not followed: flights can be chaotic.
+        `flown` tells returns [n], differentiable in the learner's policy, and whether each flight is whole [n]. `made`:
+        int32 [], how many such steps were made before. The first begins with the policy that ships and an optimiser
+        that has seen nothing. Flights can be chaotic: where the gradient is not finite, policy and optimiser stay.
         """
         first, ships = made == 0, self.shipped(state).params.policy
         optimiser = jax.tree.map(lambda x: jnp.where(first, 0, x).astype(x.dtype), state.optimiser.policy)
 
-        def loss(policy: chex.ArrayTree) -> chex.Array:
-            return -jnp.mean(returns(state._replace(params=state.params._replace(policy=policy))))
+        def loss(policy: chex.ArrayTree) -> tuple[chex.Array, chex.Array]:
+            returns, whole = flown(state._replace(params=state.params._replace(policy=policy)))
+            return -jnp.mean(returns), jnp.stack([jnp.mean(returns), jnp.mean(whole)])
 
-        worth, gradient = self._over_devices(jax.value_and_grad(loss)(ships))
-        finite = jnp.isfinite(optax.tree.norm(gradient))
-        gradient = jax.tree.map(lambda g: jnp.where(finite, g, 0.0), gradient)
+        gradient, means = self._over_devices(jax.grad(loss, has_aux=True)(ships))
         rate = self.left(made) * self.hyper["apg_learning_rate"]
-        policy, optimiser, norm = self._moved(ships, gradient, optimiser, rate)
+        moved, seen, norm = self._moved(ships, gradient, optimiser, rate)
+        finite = jnp.isfinite(norm)
+        policy, optimiser = jax.tree.map(
+            lambda new, old: jnp.where(finite, new, old), (moved, seen), (ships, optimiser)
+        )
         zero = jnp.zeros(())
         state = state._replace(
             params=state.params._replace(policy=policy),
@@ -174,7 +181,9 @@ class Learner:
             average=policy,
             updates=state.updates + 1,
         )
-        return state, Terms(*[zero] * len(Terms._fields))._replace(policy_loss=worth, policy_gradient=norm)
+        terms = Terms(*[zero] * len(Terms._fields))
+        terms = terms._replace(policy_loss=-means[0], policy_gradient=jnp.where(finite, norm, 0.0))
+        return state, terms, self.config.apg_lanes * means
 
     def _moved(
         self, params: chex.ArrayTree, gradient: chex.ArrayTree, optimiser: chex.ArrayTree, rate: chex.Array

@@ -96,7 +96,7 @@ def _controllers(task: QuadrotorTask) -> dict[str, Callable[[chex.Array], chex.A
     for name, make in CONTROLLERS.items():
         try:
             made[name] = make(task)
-        except np.linalg.LinAlgError:
+        except (np.linalg.LinAlgError, ValueError):
             continue
     return made
 

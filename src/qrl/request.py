@@ -160,6 +160,16 @@ def check(env: Env, learner: Config, where: str) -> None:
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
     except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
         raise BadInput(f"{where}: this environment does not work with jax {jax.__version__}: {error}") from None
+    if learner.climbs and not hasattr(env, "evaluation"):  # ours are differentiable
+        try:
+            jax.eval_shape(
+                jax.grad(lambda action: env.step(env.reset(jax.random.PRNGKey(0)), action).reward.sum()),
+                jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32),
+            )
+        except Exception as error:
+            raise BadInput(
+                f"{where}: key 'apg_fraction': expected 0, for this environment cannot be differentiated: {error}"
+            ) from None
 
 
 def devices(run: RunConfig) -> str:

@@ -24,7 +24,7 @@ from qrl.buffer import Ring
 from qrl.config import Config
 from qrl.learner import Learner, LearnerState, Terms
 from qrl.rollout import Lanes
-from qrl.state import LAYOUT, MEMBER, SHARD, Point, Totals, TrainState
+from qrl.state import FAULT_TERMS, LAYOUT, MEMBER, SHARD, Point, Totals, TrainState
 from qrl.types import Transition
 
 
@@ -197,21 +197,26 @@ class Trainer:
             key = jax.random.fold_in(state.key, config.learning_unrolls + i)
             keys = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(lanes)
 
-            def returns(now: LearnerState) -> chex.Array:
+            def flown(now: LearnerState) -> tuple[chex.Array, chex.Array]:
                 noise = learner.sigma(now) * learner.left(i)
                 return apg.returns(env, lambda o: learner.mean(now, o), noise, keys, config.apg_steps)
 
-            now, terms = learner.climb(state.learner, returns, i)
-            flown = config.apg_lanes * config.apg_steps
+            now, terms, (rewards, whole) = learner.climb(state.learner, flown, i)
             seen = Totals(
-                rewards=-terms.policy_loss * config.apg_lanes,
-                steps=jnp.float32(flown),
+                rewards=rewards,
+                steps=whole * config.apg_steps,
                 episodes=jnp.float32(config.apg_lanes),
-                early=jnp.float32(0.0),
+                early=config.apg_lanes - whole,
                 updates=jnp.float32(1.0),
                 terms=terms,
             )
-            return state._replace(learner=now, totals=jax.tree.map(jnp.add, state.totals, seen))
+            fault = ~jnp.isfinite(terms.policy_loss) & (state.fault_update < 0)
+            return state._replace(
+                learner=now,
+                fault_update=jnp.where(fault, state.learner.updates, state.fault_update),
+                fault_term=jnp.where(fault, FAULT_TERMS.index("reward"), state.fault_term),
+                totals=jax.tree.map(jnp.add, state.totals, seen),
+            )
 
         state = jax.lax.fori_loop(climbed(state.unrolls), climbed(until), climb, state)
         return state._replace(unrolls=until)

@@ -14,6 +14,7 @@ import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn
 
 from qrl import loop, peers, processes, request, runs
+from qrl.config import Config
 from qrl.exits import DONE, FAILED, WRONG_INPUT, complain
 from qrl.runs import Row, RunConfig
 from qrl.terminal import clock, console, stop_requested
@@ -87,7 +88,7 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
 def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, begun: float) -> int:
     seeds = f"seed {config.seed}" if config.seeds == 1 else f"{config.seeds} seeds from {config.seed}"
     devices = request.devices(config)
-    console.print(f"{config.task.name}: {config.learner.steps:,} steps, {seeds}, on {devices} -> {out}")
+    console.print(f"{config.task.name}: {_steps(config.learner)}, {seeds}, on {devices} -> {out}")
     env = request.environment(config.task)
     with stop_requested() as stopped:
         finished = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
@@ -98,6 +99,13 @@ def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, b
     if peers.first():
         _finish(out, config, finished, time.perf_counter() - begun)
     return DONE
+
+
+def _steps(config: Config) -> str:
+    if not config.climbs:
+        return f"{config.steps:,} steps"
+    learning = config.learning_unrolls * config.unroll_size
+    return f"{config.steps:,} steps ({learning:,} to learn, then {config.climbs:,} updates by the analytic gradient)"
 
 
 def _flags(args: argparse.Namespace) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from qrl import request, restore, runs
-from qrl.deploy import EVALUATION_STARTS_SEED
+from qrl.deploy import EVALUATION_STARTS_SEED, STARTS
 from qrl.evaluate import Flights
 from qrl.exits import DONE
 from qrl.runs import RunConfig
@@ -19,7 +19,6 @@ from qrl_envs import viewer
 from qrl_envs.specfile import BadInput
 from qrl_envs.viewer import Flown
 
-STARTS = 1000  # of `qrl evaluate`; a start's index is its place among them
 SHOWN = 8  # unless asked for others
 FAILURES = 6  # of them, at most, that are known to fail
 MOST = 50  # what a page can hold
