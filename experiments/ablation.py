@@ -6,7 +6,6 @@ Runs `qrl sweep` on experiments/ablation_TASK.json into OUT/ablation/TASK and wr
 and current is kept; an interrupted sweep goes on.
 """
 
-import argparse
 import csv
 import hashlib
 import json
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 import figure_runs
+from arguments import Parser
 from figure_runs import CODE, ROOT, Failed
 from qrl import runs
 
@@ -45,16 +45,8 @@ class Row(NamedTuple):
     diverged: int
 
 
-class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"ablation: {message}", file=sys.stderr)
-        sys.exit(2)
-
-
 def main(argv: list[str] | None = None) -> int:
-    parser = _Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser = Parser("ablation", __doc__)
     parser.add_argument("--out", type=Path, default=Path("experiments/out"), metavar="FOLDER")
     parser.add_argument("--only", choices=TASKS, help="one task alone")
     parser.add_argument("--fresh", action="store_true", help="make the sweeps again")

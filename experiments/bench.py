@@ -20,6 +20,7 @@ import time
 from pathlib import Path
 from typing import Any, NoReturn
 
+from arguments import Parser
 from bench_contestants import CONTESTANTS, Contestant, chosen, key
 from bench_install import NotInstalled, fingerprint, python_of
 from bench_plot import plot
@@ -34,16 +35,8 @@ OUT_OF_TIME = "out of time"
 FINISHED = ("done", OUT_OF_TIME)
 
 
-class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"bench: {message}", file=sys.stderr)
-        sys.exit(2)
-
-
 def main(argv: list[str] | None = None) -> int:
-    parser = _Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser = Parser("bench", __doc__)
     parser.add_argument("--out", type=Path, default=Path("experiments/out/bench"), metavar="FOLDER")
     parser.add_argument("--environments", type=Path, default=Path("experiments/out/peers"), metavar="FOLDER")
     parser.add_argument(

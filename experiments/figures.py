@@ -6,7 +6,6 @@ Leaves NAME.png, NAME.svg and NAME.md for each figure, and the runs in OUT/runs.
 (`qrl train`), one at a time; one that is finished and current is kept, an unfinished one gone on with.
 """
 
-import argparse
 import functools
 import shlex
 import shutil
@@ -21,6 +20,7 @@ from matplotlib.figure import Figure
 
 import figure_captions as captions
 import figure_plots as draw
+from arguments import Parser
 from figure_captions import Caption, Made
 from figure_flights import Flown, flown
 from figure_plots import SHOWN, Curves, Rate
@@ -40,14 +40,6 @@ FIGURES = {  # name -> the beginnings of the names of its runs; of several the f
 OUT = Path("experiments/out/figures")
 
 
-class _Parser(argparse.ArgumentParser):
-    """argparse with one-line errors."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"figures: {message}", file=sys.stderr)
-        sys.exit(2)
-
-
 class Source(NamedTuple):
     """A run that is there, and its folder."""
 
@@ -57,8 +49,8 @@ class Source(NamedTuple):
 
 def main(argv: list[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
-    parser = _Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("--fast", action="store_true", help="shorter runs, fewer seeds: in three minutes")
+    parser = Parser("figures", __doc__)
+    parser.add_argument("--fast", action="store_true", help="shorter runs, fewer seeds")
     parser.add_argument("--out", type=Path, help=f"({OUT}; with --fast {OUT}_fast)", metavar="FOLDER")
     parser.add_argument("--only", nargs="+", default=list(FIGURES), help=", ".join(FIGURES), metavar="NAME")
     parser.add_argument("--fresh", action="store_true", help="make the runs again")
