@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export view sweep tasks figures ablation bench test smoke lint torture FORCE
+.PHONY: help setup train evaluate export view sweep tasks figures ablation gallery bench test smoke lint torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -32,6 +32,8 @@ define HELP
        ARGS="--only pendulum hover"    some of them; --fresh, --out FOLDER
   make ablation                      the paper's objectives side by side on pendulum and hover, as a table
        ARGS="--only pendulum"          one task; --fresh, --out FOLDER
+  make gallery                       docs/gallery.md: the figures, the shipped presets' flights, ablation and bench
+       ARGS=--fast                     with the figures of FAST=1; --out FOLDER
   make bench                         timings beside peers, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
@@ -84,6 +86,9 @@ figures: $(STAMP)
 
 ablation: $(STAMP)
 	@exec $(VENV)/bin/python experiments/ablation.py $(ARGS)
+
+gallery: $(STAMP)
+	@exec $(VENV)/bin/python experiments/gallery.py $(ARGS)
 
 bench: $(STAMP)
 	@exec $(VENV)/bin/python experiments/bench.py $(ARGS)

@@ -26,6 +26,7 @@ from figure_flights import Flown, flown
 from figure_plots import SHOWN, Curves, Rate
 from figure_runs import PAPER_RATES, Failed, Wanted, current, make, reports, wanted
 from qrl import request, runs
+from qrl.exits import DONE, FAILED, WRONG_INPUT
 from qrl.rollout import episode_steps
 from qrl_envs.specfile import BadInput, nearest
 
@@ -66,14 +67,14 @@ def main(argv: list[str] | None = None) -> int:
         figures(args.only, out, command + " FAST=1" * (words == ["--fast"]), fast=args.fast, fresh=args.fresh)
     except (OSError, Failed, BadInput) as error:
         print(f"figures: {error}", file=sys.stderr)
-        return 1
-    return 0
+        return WRONG_INPUT if isinstance(error, BadInput) else FAILED
+    return DONE
 
 
-def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: bool) -> None:
-    """Each figure as soon as its runs are there."""
+def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: bool) -> dict[str, Caption]:
+    """Each figure as soon as its runs are there; their captions."""
     begun = time.perf_counter()
-    plan, there = wanted(fast=fast), set[str]()
+    plan, there, told = wanted(fast=fast), set[str](), dict[str, Caption]()
     fly = functools.cache(flown)
     note = " (FAST: shorter runs and fewer seeds than those of `make figures`)" if fast else ""
     for name in names:
@@ -83,10 +84,12 @@ def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: boo
                 obtain(run, folder, fresh=fresh)
                 there.add(run.name)
         figure, caption = drawn(name, sources, fly)
+        told[name] = caption
         draw.save(figure, out / name)
         runs.replace_text(out / f"{name}.md", captions.page(caption, Made(command, runs.commit(), note, sources)))
         print(f"figures: {out / name}.png, .svg, .md: {caption.verdict}", flush=True)
     print(f"figures: done in {time.perf_counter() - begun:.0f} s", flush=True)
+    return told
 
 
 def needed(name: str, plan: list[Wanted]) -> list[Wanted]:

@@ -125,7 +125,7 @@ def test_an_unfinished_run_goes_on_and_a_stale_one_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     called: list[list[str]] = []
-    monkeypatch.setattr(figure_runs, "qrl", called.append)
+    monkeypatch.setattr(figure_runs, "qrl", lambda words, **_: called.append(words))
     unfinished = folder_of(tmp_path / "unfinished", HOVER, finished=False)
     stale = folder_of(tmp_path / "stale", HOVER, seeds=3)
     for folder in (unfinished, stale, tmp_path / "new"):
@@ -145,7 +145,7 @@ def test_an_unfinished_run_goes_on_and_a_stale_one_is_made_again(
 
 def test_a_current_run_is_not_made_again_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
-    monkeypatch.setattr(figure_runs, "qrl", called.append)
+    monkeypatch.setattr(figure_runs, "qrl", lambda words, **_: called.append(words))
     folder = folder_of(tmp_path / "run", HOVER)
     figures.obtain(HOVER, folder, fresh=False)
     assert called == []
@@ -310,7 +310,7 @@ def test_a_caption_says_how_it_was_made_and_its_numbers_are_the_runs(tmp_path: P
     # By hand: quartiles of 150 and 160; 99 % first at the second report and at the third.
     assert "return 155.0 [152.5 … 157.5], success 100 [100 … 100] %" in page
     assert "2 of 2 seeds" in page
-    assert "first after 200 [200 … 300] (median, range) steps" in page
+    assert "after 200 [200 … 300] (median, range) steps" in page
     assert "**Verdict: exceeded.**" in page
     assert "`make figures FAST=1` at commit abc123; a note" in page
     assert "- `hover`: `qrl train hover --seeds 2 --preset hover_fast --steps 320000`, seeds 0–1" in page
@@ -333,9 +333,15 @@ def test_hover_is_held_against_ten_million_steps() -> None:
     assert verdict(1e6, 2e7, np.inf) == NOT
 
 
+def test_solved_is_held_to_the_end() -> None:
+    found = captions.solved_at(curves([0.0] * 4, [0.0] * 4, success=([0.0, 1.0, 0.5, 1.0], [1.0, 1.0, 1.0, 0.9])))
+    assert found.tolist() == [400.0, np.inf]
+
+
 def test_the_circle_is_counted_in_episodes() -> None:
+    """Of the paper's 200 steps, however long ours are."""
     caption = captions.circle(curves(*SEEDS, success=SUCCESS), episode_steps=50)
-    assert any("In episodes of 50 steps: never [4 … never]" in found for found in caption.found)
+    assert any("episodes of 200 steps that is never [1 … never]" in found for found in caption.found)
     assert any("2 of 5 seeds" in found for found in caption.found)
     assert caption.verdict == NOT
     assert captions.circle(curves(*SEEDS[:2], success=SUCCESS[:2]), 50).verdict == EXCEEDED
@@ -417,7 +423,7 @@ def test_both_grids_hold_the_rows_that_the_table_explains(name: str) -> None:
 
 def test_a_stale_sweep_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
-    monkeypatch.setattr(figure_runs, "qrl", called.append)
+    monkeypatch.setattr(figure_runs, "qrl", lambda words, **_: called.append(words))
     grid, out = tmp_path / "grid.json", tmp_path / "out"
     grid.write_text("{}")
     for text, kept in (("{}", False), ("{}", True), ('{"seeds": 2}', False)):
