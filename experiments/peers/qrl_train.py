@@ -1,4 +1,4 @@
-"""qrl itself, in one process: `qrl_train.py pendulum|hover|circle --seed N [--preset NAME] [--checks N]`.
+"""qrl itself, in one process: `qrl_train.py pendulum|hover|circle --seed N [--preset NAME] [--no-apg] [--checks N]`.
 
 The preset (TASK_fast where it ships, else the task's own) says how many steps there are: step size and noise follow its
 schedule, so that a policy is best at its end. It is checked `--checks` times on the way, as the other contestants are.
@@ -22,11 +22,11 @@ from qrl.train import Trainer
 STARTS, EVALUATION_STARTS_SEED = 1000, 1_000_003  # those of `qrl evaluate`
 
 
-def contestant(task: str, preset: str | None, seed: int) -> tuple[Trainer, Any, runs.RunConfig]:
+def contestant(task: str, preset: str | None, seed: int, flags: dict[str, Any]) -> tuple[Trainer, Any, runs.RunConfig]:
     """What trains, at which point, and how it was asked for."""
     fast = f"{task}_fast"
     name = preset or (fast if fast in runs.presets() else task)
-    run = request.run_config(task, None, runs.ConfigFile(learner=runs.preset(name)), {}, seed, 1)
+    run = request.run_config(task, None, runs.ConfigFile(learner=runs.preset(name)), flags, seed, 1)
     env = request.environment(run.task)
     return Trainer(env, run.learner), stack([point(env, run.learner)]), run
 
@@ -43,9 +43,11 @@ def main() -> None:
     parser.add_argument("task", choices=["pendulum", "hover", "circle"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--preset")
+    parser.add_argument("--no-apg", action="store_true", help="the paper's method to the end")
     parser.add_argument("--checks", type=int, default=20)
     args = parser.parse_args()
-    trainer, points, run = contestant(args.task, args.preset, args.seed)
+    flags = {"apg_fraction": 0.0} if args.no_apg else {}
+    trainer, points, run = contestant(args.task, args.preset, args.seed, flags)
     config = run.learner
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
 
