@@ -12,6 +12,7 @@ import pytest
 
 from campaign import TORTURE
 from frontdoor import TINY, complaint, qrl
+from qrl_envs.pictures import errors
 
 
 def test_training_leaves_the_run_folder(trained: Path) -> None:
@@ -89,15 +90,20 @@ def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert (run / "seed-0" / "settle.png").exists()
 
 
-def test_evaluate_flies_other_runs_beside(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """From the same starts, a column each: a run beside itself flies the same; what fails is said by its start."""
+def test_evaluate_flies_other_runs_beside(
+    trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the same starts, a column each: a run beside itself flies the same; what fails is said by its start, and how
+    many are drawn where not all are."""
     run = shutil.copytree(trained, tmp_path / "run")
-    assert qrl("evaluate", run, "--starts", "5", "--beside", trained) == 0
+    monkeypatch.setattr(errors, "LINES", ())
+    assert qrl("evaluate", run, "--starts", "5", "--beside", trained, trained) == 0
     result = json.loads((run / "evaluation.json").read_text())
     beside = result["beside"][str(trained)]
     assert {name: result[name] for name in beside} == beside
     said = capsys.readouterr().out
-    assert str(trained) in said
+    assert said.count(str(trained)) == 1
+    assert "evaluation.png shows the first 0 of 1 beside the policy" in said
     assert result["failed"] == len(result["failures"]) == round(5 * (1 - result["success"]))
     assert [each.keys() for each in result["failures"]] == [{"start", "angle_rad", "rate_rad_s", "reason"}] * 5
     assert "5 of 5 starts failed: 0 1 2 3 4 (qrl view RUN --starts 0 replays one)" in said
@@ -127,6 +133,13 @@ def test_beside_refuses_another_task(
     line = complaint(capsys, "evaluate", trained, "--starts", "5", "--beside", other)
     assert says in line
     assert str(other) in line
+
+
+def test_beside_needs_a_checkpoint(trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = shutil.copytree(trained, tmp_path / "other")
+    shutil.rmtree(other / "checkpoints")
+    line = complaint(capsys, "evaluate", trained, "--starts", "5", "--beside", other)
+    assert line.endswith(f"{other}: --beside: no checkpoint")
 
 
 def test_off_nominal_is_for_quadrotors(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

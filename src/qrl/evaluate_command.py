@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from qrl import evaluate_table, request, restore, runs
+from qrl import checkpoint, evaluate_table, request, restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE
-from qrl.pilots import NOMINAL, Baselines, Policies, Worlds
+from qrl.pilots import CONTROLLERS, NOMINAL, Baselines, Policies, Worlds
 from qrl.runs import RunConfig
 from qrl.terminal import console
 from qrl_envs import failures
@@ -46,7 +46,7 @@ class Flown:
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every seed of a run from fresh starts; print a table, leave evaluation.json and plots in each folder."""
     config = request.stored(args.run)
-    others = [(folder, _of_same_task(folder, args.run, config)) for folder in args.beside]
+    others = [(folder, _of_same_task(folder, args.run, config)) for folder in dict.fromkeys(args.beside)]
     task = request.spec(config.task) if config.task.spec else None
     named = _conditions(args.run, config, task) if args.off_nominal else {}
     worlds = Worlds(
@@ -91,6 +91,9 @@ def _of_same_task(folder: Path, run: Path, config: RunConfig) -> RunConfig:
             f"{folder}: --beside: expected a run of the same task as {run}, '{config.task.name}', found one of"
             f" '{other.task.name}'{' that differs' if other.task.name == config.task.name else ''}"
         )
+    for member in runs.members(folder, other):
+        if not checkpoint.steps(member):
+            raise BadInput(f"{member}: --beside: no checkpoint")
     return other
 
 
@@ -176,6 +179,11 @@ def _print(table: list[dict[str, Any]], flown: Flown, named: dict[str, Condition
             evaluate_table.off_nominal(
                 ", ".join(filter(None, (name if name not in policies else "policy", said))), result
             )
+    for name in CONTROLLERS if flown.baselines else ():
+        if name not in flown.baselines:
+            console.print(f"{name}: none, for it cannot stabilise this vehicle")
+    if len(flown.flights) > len(errors.LINES):
+        console.print(f"evaluation.png shows the first {len(errors.LINES)} of {len(flown.flights)} beside the policy")
     for name, result in policies.items():
         if "failures" in result:
             evaluate_table.failures(name, result)
