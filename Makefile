@@ -33,7 +33,7 @@ define HELP
   make ablation                      the paper's objectives side by side on pendulum and hover, as a table
        ARGS="--only pendulum"          one task; --fresh, --out FOLDER
   make gallery                       docs/gallery.md: the figures, the shipped presets' flights, ablation and bench
-       ARGS=--fast                     with the figures of FAST=1; --out FOLDER
+       FAST=1                          with the figures of FAST=1; ARGS="--out FOLDER", --fresh
   make bench                         timings beside peers, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
@@ -88,7 +88,7 @@ ablation: $(STAMP)
 	@exec $(VENV)/bin/python experiments/ablation.py $(ARGS)
 
 gallery: $(STAMP)
-	@exec $(VENV)/bin/python experiments/gallery.py $(ARGS)
+	@exec $(VENV)/bin/python experiments/gallery.py $(if $(filter-out 0,$(FAST)),--fast) $(ARGS)
 
 bench: $(STAMP)
 	@exec $(VENV)/bin/python experiments/bench.py $(ARGS)

@@ -10,15 +10,14 @@ import csv
 import hashlib
 import json
 import shutil
-import signal
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import figure_runs
-from arguments import Parser
+from arguments import Parser, run_to_the_end
 from figure_runs import CODE, ROOT, Failed
 from qrl import runs
 
@@ -135,14 +134,5 @@ def spread(values: Any, form: str = ".1f") -> str:
     return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"
 
 
-def stop(*_: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)  # or the sweep at work would go on alone
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print("ablation: interrupted; the same command goes on", file=sys.stderr)
-        sys.exit(1)
+    run_to_the_end("ablation", main)

@@ -1,7 +1,9 @@
 """The experiments' command lines."""
 
 import argparse
+import signal
 import sys
+from collections.abc import Callable
 from typing import NoReturn
 
 
@@ -15,3 +17,17 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         print(f"{self.prog}: {message}", file=sys.stderr)
         sys.exit(2)
+
+
+def run_to_the_end(prog: str, main: Callable[[], int]) -> NoReturn:
+    """Exit as `main` says; Ctrl-C or SIGTERM first ends the run at work, which would go on alone, and is one line."""
+
+    def stop(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted; the same command goes on", file=sys.stderr)
+        sys.exit(1)

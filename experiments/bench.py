@@ -9,6 +9,7 @@ run), bench.md (tables) and bench.png (ratios). A peer that cannot be installed 
 """
 
 import argparse
+import hashlib
 import json
 import os
 import platform
@@ -18,9 +19,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from arguments import Parser
+import figure_runs
+from arguments import Parser, run_to_the_end
 from bench_contestants import CONTESTANTS, Contestant, chosen, key
 from bench_install import NotInstalled, fingerprint, python_of
 from bench_plot import plot
@@ -100,7 +102,7 @@ def installed(
 
 
 def made(path: Path, contestant: Contestant, budget_seconds: float) -> bool:
-    """Whether this very run is there, of this machine and these versions, and did not fail.
+    """Whether this very run is there, of this machine, these versions and, if it is qrl's, this code; and did not fail.
 
     Which commit's it is makes no difference: it says so, and so does the page.
     """
@@ -116,10 +118,12 @@ def command(contestant: Contestant) -> list[str]:
 
 
 def circumstances(contestant: Contestant) -> dict[str, Any]:
-    """What must be the same for a run to be like another: machine and versions; a peer's are its requirements."""
+    """What must be the same for a run to be like another: machine and versions; a peer's are its requirements, qrl's
+    the code that trains and its presets."""
     here = {name: value for name, value in machine().items() if name != "commit"}
     if contestant.environment is None:
-        return here
+        presets = json.dumps([records.preset(name) for name in records.presets()])
+        return here | {"code": hashlib.sha256(f"{figure_runs.sha256()} {presets}".encode()).hexdigest()}
     return here | {"requirements": fingerprint(PEERS / f"{contestant.environment}.txt")}
 
 
@@ -209,14 +213,5 @@ def replace(path: Path, text: str) -> None:
     temporary.replace(path)
 
 
-def stop(*_: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)  # or the run at work would go on alone
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print("bench: interrupted; the same command goes on", file=sys.stderr)
-        sys.exit(1)
+    run_to_the_end("bench", main)

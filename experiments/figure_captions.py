@@ -11,7 +11,7 @@ import numpy as np
 
 from figure_flights import Flown
 from figure_plots import PUBLISHED, Curves, Rate, thousands
-from figure_runs import PAPER_RATES, Wanted
+from figure_runs import PAPER_RATES, PARTED, Wanted
 from qrl import request
 from qrl.runs import RunConfig
 from qrl_envs.conditions import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
@@ -80,8 +80,9 @@ def page(caption: Caption, made: Made) -> str:
 
 def _command(one: Wanted, config: RunConfig) -> str:
     """As it was run: results agree only to rounding on another number of devices."""
-    cpus = len(config.devices) if all("cpu" in device.lower() for device in config.devices) else 0
-    return f"{f'JAX_NUM_CPU_DEVICES={cpus} ' if cpus > 1 else ''}qrl {' '.join(one.words)}"
+    parted = len(config.devices) > 1 and all("cpu" in device.lower() for device in config.devices)
+    before = "".join(f"{name}={value} " for name, value in PARTED.items()) if parted else ""
+    return f"{before}qrl {' '.join(one.words)}"
 
 
 def _seeds(config: RunConfig) -> str:

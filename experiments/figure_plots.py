@@ -172,7 +172,7 @@ def thousands(value: float) -> str:
     """200k, 1.5M."""
     for unit, name in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= unit:
-            return f"{value / unit:g}{name}"
+            return f"{value / unit:.3g}{name}"
     return f"{value:g}"
 
 

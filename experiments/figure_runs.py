@@ -21,6 +21,8 @@ TRAINING = ("qrl.laps", "qrl_envs.env")  # what they import, and they, decide a 
 CODE = "code.sha256"  # in a run's folder: of which code it is
 
 SEEDS, FAST_SEEDS = 6, 4  # even, so that two cores share them
+# A device each, and no threads of XLA's besides: docs/profile.md.
+PARTED = {"JAX_NUM_CPU_DEVICES": "2", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
 PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
 PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
 METHOD = {"apg_fraction": 0.0}  # the paper's method to the end, on trajectories that symmetries turn
@@ -169,7 +171,7 @@ def make(one: Wanted, folder: Path) -> float:
 
 
 def qrl(words: list[str], *, parted: bool = False) -> None:
-    """The command line in a process of its own, `parted`: with two devices for its seeds; Failed if it fails."""
+    """The command line in a process of its own, `parted` as `environment` says; Failed if it fails."""
     command = [sys.executable, "-m", "qrl", *words]
     # In a session of its own, so that Ctrl-C reaches it once: through us.
     with subprocess.Popen(command, env=environment(parted=parted), start_new_session=True) as process:
@@ -184,12 +186,11 @@ def qrl(words: list[str], *, parted: bool = False) -> None:
 
 
 def environment(*, parted: bool) -> dict[str, str]:
-    """Of a run's process: this code's own packages and, where seeds may part between two of a CPU's cores, a device for
-    each of these. XLA's threads besides would cost a seventh of the time. What the caller's own says goes before."""
+    """Of a run's process: this code's own packages and, where its seeds or members may part between two of a CPU's
+    cores, PARTED; what the caller's own environment says goes before."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    two = {"JAX_NUM_CPU_DEVICES": "2", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
     paths = os.pathsep.join([str(ROOT / "src"), str(ROOT / "envs"), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return {**(two if parted and cores > 1 else {}), **os.environ, "PYTHONPATH": paths}
+    return {**(PARTED if parted and cores > 1 else {}), **os.environ, "PYTHONPATH": paths}
 
 
 # What a run says

@@ -9,24 +9,23 @@ Leaves NAME.png, NAME.svg and NAME.md for each figure, and the runs in OUT/runs.
 import functools
 import shlex
 import shutil
-import signal
 import sys
 import time
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NamedTuple
 
 import jax
 from matplotlib.figure import Figure
 
 import figure_captions as captions
 import figure_plots as draw
-from arguments import Parser
+from arguments import Parser, run_to_the_end
 from figure_captions import Caption, Made
 from figure_flights import Flown, flown
 from figure_plots import SHOWN, Curves, Rate
 from figure_runs import PAPER_RATES, Failed, Wanted, current, make, reports, wanted
 from qrl import request, runs
-from qrl.exits import DONE, FAILED, WRONG_INPUT
+from qrl.exits import DONE, FAILED
 from qrl.rollout import episode_steps
 from qrl_envs.specfile import BadInput, nearest
 
@@ -67,7 +66,7 @@ def main(argv: list[str] | None = None) -> int:
         figures(args.only, out, command + " FAST=1" * (words == ["--fast"]), fast=args.fast, fresh=args.fresh)
     except (OSError, Failed, BadInput) as error:
         print(f"figures: {error}", file=sys.stderr)
-        return WRONG_INPUT if isinstance(error, BadInput) else FAILED
+        return FAILED
     return DONE
 
 
@@ -154,15 +153,6 @@ def rates(sources: list[Source]) -> list[Rate]:
     return found
 
 
-def stop(*_: object) -> NoReturn:
-    raise KeyboardInterrupt
-
-
 if __name__ == "__main__":
-    signal.signal(signal.SIGTERM, stop)  # or the run at work would go on alone
     jax.config.update("jax_platforms", "cpu")  # a GPU is the runs'
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print("figures: interrupted; the same command goes on", file=sys.stderr)
-        sys.exit(1)
+    run_to_the_end("figures", main)

@@ -256,7 +256,7 @@ def test_a_run_is_made_once(tmp_path: Path) -> None:
     assert bench.made(path, peer, 60.0)
     assert not bench.made(path, peer, 90.0)
     assert not bench.made(path, peer._replace(words=("--steps", "2")), 60.0)
-    for other in ({"CPU": "abacus"}, {"jax": "0.1"}, {"requirements": "others"}):
+    for other in ({"CPU": "abacus"}, {"jax": "0.1"}, {"requirements": "others"}, {"code": "other"}):
         path.write_text(json.dumps(kept | {"circumstances": here | other}))
         assert not bench.made(path, peer, 60.0)
     path.write_text(json.dumps(asked | {"outcome": "done"}))

@@ -71,6 +71,9 @@ def evaluate(args: argparse.Namespace) -> int:
         runs.write_json(args.run / "evaluation.json", table)
     console.print(f"{config.task.name}: {args.starts:,} fresh starts, deterministic policy")
     _print(table, flown, named)
+    for name in CONTROLLERS if baselines else ():
+        if name not in flown.baselines:
+            console.print(f"{name}: there is none for this vehicle")
     return DONE
 
 
@@ -179,9 +182,6 @@ def _print(table: list[dict[str, Any]], flown: Flown, named: dict[str, Condition
             evaluate_table.off_nominal(
                 ", ".join(filter(None, (name if name not in policies else "policy", said))), result
             )
-    for name in CONTROLLERS if flown.baselines else ():
-        if name not in flown.baselines:
-            console.print(f"{name}: none, for it cannot stabilise this vehicle")
     if len(flown.flights) > len(errors.LINES):
         console.print(f"evaluation.png shows the first {len(errors.LINES)} of {len(flown.flights)} beside the policy")
     for name, result in policies.items():
