@@ -68,7 +68,7 @@ def wanted(*, fast: bool) -> list[Wanted]:
     return [
         *found,
         Wanted("hover", "hover", "hover", METHOD | {"steps": 1_500_000, "reports": 25}, seeds),
-        Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 1_800_000}, seeds),
+        Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 2_400_000, "reports": 20}, seeds),
         Wanted("hover-flight", "hover", "hover", METHOD | {"steps": 4_500_000}),
         Wanted("circle-flight", "circle", "circle", METHOD | {"steps": 4_500_000}),
     ]
