@@ -4,19 +4,19 @@
 
 The paper's figures (as `make figures` makes them), the policies of the presets that ship (trained, flown by `qrl
 evaluate` beside controllers and PPO, and shown by `qrl view`), and what `make ablation` and `make bench` left, where
-they did. Runs are kept while they are current. The viewer's picture needs Chromium; without it the old one stays.
+they did. Runs are kept while they are current. The viewer's picture needs Chromium and its driver; without them the old
+one stays.
 """
 
 import json
 import shutil
-import subprocess
 import sys
-import tempfile
-from contextlib import suppress
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
 
+import browser
 import figure_runs
 import figures
 import gallery_page
@@ -28,8 +28,6 @@ from qrl.exits import DONE, FAILED
 from qrl_envs.specfile import BadInput
 
 OUT, RUNS = Path("docs"), Path("experiments/out")
-CHROMIUMS = ("chromium", "chromium-browser", "google-chrome")
-DRAWN_SECONDS = 300  # by a processor, if need be
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -102,31 +100,28 @@ def made(one: Wanted, folder: Path, *, fresh: bool) -> None:
 
 
 def copy(source: Path, target: Path) -> None:
-    """Whole or not at all."""
+    whole(target, lambda temporary: shutil.copyfile(source, temporary))
+
+
+def whole(target: Path, write: Callable[[Path], object]) -> None:
+    """The file whole or not at all."""
     temporary = target.with_name(f"{target.name}.tmp")
-    shutil.copyfile(source, temporary)
+    write(temporary)
     temporary.replace(target)
 
 
 def photograph(html: Path, address: str, target: Path) -> None:
-    """The page at `address` as headless Chromium draws it; where there is none or it fails, a warning, and `target`
-    stays as it is."""
-    browser = next(filter(None, map(shutil.which, CHROMIUMS)), None)
-    if not browser:
-        print(f"gallery: no Chromium: {target} stays as it is", file=sys.stderr)
-        return
-    flags = ["headless=new", "no-sandbox", "use-angle=swiftshader", "enable-unsafe-swiftshader", "hide-scrollbars"]
-    flags += ["disable-dev-shm-usage", "window-size=1280,800", "virtual-time-budget=30000"]
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as there:
-        taken = Path(there) / "view.png"
-        words = [*(f"--{flag}" for flag in flags), f"--user-data-dir={there}", f"--screenshot={taken}"]
-        words += [f"{html.resolve().as_uri()}{address}"]
-        with suppress(subprocess.TimeoutExpired):
-            subprocess.run([browser, *words], capture_output=True, timeout=DRAWN_SECONDS, check=False)
-        if taken.exists():
-            copy(taken, target)
-        else:
-            print(f"gallery: {browser} took no picture of {html}: {target} stays as it is", file=sys.stderr)
+    """The page at `address` as Chromium draws it; where there is none or it fails, a warning, and `target` stays."""
+    wrong = f"missing here: {', '.join(browser.missing())}" if browser.missing() else None
+    if not wrong:
+        with browser.chromium({}) as driver:
+            wrong = browser.drawn(driver, f"{html.resolve().as_uri()}{address}")
+            browser.wait_for(driver, browser.NEXT_FRAME)
+            picture = driver.get_screenshot_as_png()
+        if not wrong:
+            whole(target, lambda temporary: temporary.write_bytes(picture))
+    if wrong:
+        print(f"gallery: {target} stays as it is: {wrong}", file=sys.stderr)
 
 
 def left(path: Path) -> str:

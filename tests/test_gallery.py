@@ -1,7 +1,6 @@
 """The gallery: its page shows what its runs found, and every picture that it links is there."""
 
 import re
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 
+import browser
 import figure_runs
 import figures
 import gallery
@@ -165,8 +165,8 @@ def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 
 
 def test_the_viewer_is_photographed(tmp_path: Path) -> None:
-    """Its scene and plots in many colours, not an empty page."""
-    need([] if any(map(shutil.which, gallery.CHROMIUMS)) else ["chromium"])
+    """Its scene, whole: the vehicle's and the tolerance's colours, down to where the scene ends."""
+    need(browser.missing())
     t = np.arange(101) * 0.01
     observations, actions = np.zeros((1, 101, 18)), np.zeros((1, 100, 4))
     observations[..., [0, 4, 8]] = 1.0
@@ -175,16 +175,21 @@ def test_the_viewer_is_photographed(tmp_path: Path) -> None:
     (tmp_path / "view.html").write_text(viewer.page(task.load("hover"), "made up", flown))
     gallery.photograph(tmp_path / "view.html", "#start=0&t=0.5", tmp_path / "view.png")
     pixels = (255 * image.imread(tmp_path / "view.png")[..., :3]).astype(int)
-    assert pixels.shape == (800, 1280, 3)
+    assert pixels.shape == (browser.HEIGHT, browser.WIDTH, 3)
     scene = pixels[200:600, 200:600]
     assert len(np.unique(scene.reshape(-1, 3), axis=0)) > 100
 
 
-def test_without_chromium_the_picture_stays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("missing", [["chromium"], []])
+def test_a_picture_that_cannot_be_taken_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], missing: list[str]
 ) -> None:
-    monkeypatch.setattr(shutil, "which", lambda _: None)
+    """Without Chromium, or of a page that does not draw."""
+    if not missing:
+        need(browser.missing())
+    monkeypatch.setattr(browser, "missing", lambda: missing)
     (tmp_path / "view.png").write_text("old")
+    (tmp_path / "view.html").write_text("<script>qrlView = {ready: Promise.reject('no scene')}</script>")
     gallery.photograph(tmp_path / "view.html", "", tmp_path / "view.png")
     assert (tmp_path / "view.png").read_text() == "old"
-    assert "no Chromium" in capsys.readouterr().err
+    assert ("missing here: chromium" if missing else "no scene") in capsys.readouterr().err

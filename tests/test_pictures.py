@@ -221,6 +221,15 @@ def test_others_are_drawn_beside_by_their_medians() -> None:
     assert drawn(share)[0].min() == 100.0
 
 
+def test_a_long_name_is_told_by_its_end() -> None:
+    flights = np.zeros((FLIGHTS, SAMPLES, 18))
+    figure = errors_of.figure(
+        task.load("hover"), flights, {"experiments/out/gallery/circle-ppo": flights, "a/b": flights}
+    )
+    labels = {line.get_label() for axes in figure.axes for line in axes.lines}
+    assert {"median of …/gallery/circle-ppo", "median of a/b"} <= labels
+
+
 def test_the_map_has_medians_by_tilt_and_speed() -> None:
     """In the cell of their start; with too few flights it is empty, and half that never settle make it infinite."""
     tilt = np.array([1.0, 2.0, 3.0, 170.0, 180.0, 175.0, 40.0, 40.0])

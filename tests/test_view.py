@@ -19,10 +19,10 @@ import pytest
 from matplotlib import image
 from selenium import webdriver
 from selenium.webdriver import ActionChains
-from selenium.webdriver.chrome.service import Service
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import Select
 
+import browser
 from frontdoor import TINY, complaint, qrl
 from machines import need
 from qrl import runs
@@ -255,28 +255,9 @@ def test_what_is_no_run_of_ours_is_refused(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[webdriver.Chrome]:
-    """Headless, without a GPU and without a network."""
-    need([name for name in ("chromium", "chromedriver") if not shutil.which(name)])
-    options = webdriver.ChromeOptions()
-    options.binary_location = shutil.which("chromium") or ""
-    for flag in ("headless=new", "no-sandbox", "use-angle=swiftshader", "enable-unsafe-swiftshader"):
-        options.add_argument(f"--{flag}")
-    options.add_argument("--disable-dev-shm-usage")  # containers have little of it
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
-    driver.set_script_timeout(240)  # the machine may be busy, and draws by its processor
-    driver.set_page_load_timeout(240)
-    driver.execute_cdp_cmd("Network.enable", {})
-    off = {"offline": True, "latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
-    driver.execute_cdp_cmd("Network.emulateNetworkConditions", off)
-    _size(driver, 1280, 800)
-    yield driver
-    driver.quit()
-
-
-def _size(driver: webdriver.Chrome, width: int, height: int) -> None:
-    window = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", window)
+    need(browser.missing())
+    with browser.chromium({"browser": "ALL", "performance": "ALL"}) as driver:
+        yield driver
 
 
 class Shown:
@@ -290,14 +271,8 @@ class Shown:
         self.driver.get("about:blank")
         for kind in ("browser", "performance"):
             self.driver.get_log(kind)  # what was before is not this page's
-        self.driver.get(f"{self.path.as_uri()}{address}")
-        wrong = self.wait_for("qrlView.ready")
+        wrong = browser.drawn(self.driver, f"{self.path.as_uri()}{address}")
         assert wrong is None, wrong
-
-    def wait_for(self, promise: str) -> Any:
-        return self.driver.execute_async_script(
-            f"const done = arguments[0]; (async () => {promise})().then(() => done(null), error => done(String(error)))"
-        )
 
     def ask(self, expression: str) -> Any:
         return self.driver.execute_script(f"return {expression}")
@@ -323,7 +298,7 @@ class Shown:
 
     def pixels(self, css: str) -> Array:
         """What an element looks like, [height, width, 3] of 0 … 255."""
-        self.wait_for("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        browser.wait_for(self.driver, browser.NEXT_FRAME)
         picture = image.imread(io.BytesIO(self.find(css).screenshot_as_png), format="png")
         return np.round(255 * picture[..., :3]).astype(int)
 
@@ -514,7 +489,7 @@ def test_it_fits_the_window(shown: Shown) -> None:
     """A laptop's, and then a phone's, on which a page scrolls."""
     try:
         for width, height in ((1280, 800), (390, 844)):
-            _size(shown.driver, width, height)
+            browser.size(shown.driver, width, height)
             shown.until("document.querySelector('#scene .main-svg').clientWidth === $('scene').clientWidth")
             page = shown.ask("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]")
             assert page[0] <= width
@@ -525,4 +500,4 @@ def test_it_fits_the_window(shown: Shown) -> None:
             drawing, caption = shown.find("#scene .main-svg").rect, shown.find("#scale").rect
             assert drawing["y"] + drawing["height"] <= caption["y"] + 1
     finally:
-        _size(shown.driver, 1280, 800)
+        browser.size(shown.driver, 1280, 800)

@@ -22,6 +22,7 @@ LINES: tuple[dict[str, Any], ...] = (  # told apart without colour too
     {"color": COLOURS[3], "linestyle": (0, (1, 1))},
     {"color": "black", "linestyle": (0, (5, 1.5, 1, 1.5))},
 )
+SHORT = 24  # letters of a name in the legend
 Others = Mapping[str, np.ndarray]  # by name, observations [n, K + 1, F] of others from the same starts
 
 
@@ -61,8 +62,11 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
 
 
 def _short(name: str) -> str:
-    """The end of a folder's long name, which tells it from others."""
-    return name if len(name) <= 24 else f"…{name[-23:]}"
+    """A folder's long name by its last parts, which tell it from others."""
+    parts = name.split("/")
+    while len(parts) > 1 and len("/".join(parts)) > SHORT:
+        parts = parts[1:]
+    return name if len(name) <= SHORT else f"…/{'/'.join(parts)}"
 
 
 def _ranks(errors: np.ndarray) -> np.ndarray:
