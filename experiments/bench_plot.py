@@ -13,9 +13,9 @@ from bench_tables import BARS, QRL, Run, Spread, by_seed, figures, number, ratio
 
 COLOURS = {"training": "#0072B2", "total": "#E69F00", "speed": "#009E73"}  # of Okabe and Ito
 NAMES = {
-    "training": "training seconds, peer / qrl",
-    "total": "seconds from start to solved, peer / qrl",
-    "speed": "steps a second, qrl / peer",
+    "training": "training seconds, theirs / qrl's",
+    "total": "seconds from start to solved, theirs / qrl's",
+    "speed": "steps a second, qrl's / theirs",
 }
 
 

@@ -289,4 +289,5 @@ def test_every_contestant_is_there() -> None:
     for contestant in CONTESTANTS:
         assert (bench.PEERS / contestant.script).is_file()
         assert contestant.environment is None or (bench.PEERS / f"{contestant.environment}.txt").is_file()
-    assert [c.name for c in chosen(["pendulum/brax-ppo", "circle"])] == ["Brax PPO", "qrl", "Brax PPO"]
+    named = [c.name for c in chosen(["pendulum/brax-ppo", "circle"])]
+    assert named == ["Brax PPO", "qrl", "qrl without APG", "Brax PPO"]

@@ -139,7 +139,7 @@ def test_beside_needs_a_checkpoint(trained: Path, tmp_path: Path, capsys: pytest
     other = shutil.copytree(trained, tmp_path / "other")
     shutil.rmtree(other / "checkpoints")
     line = complaint(capsys, "evaluate", trained, "--starts", "5", "--beside", other)
-    assert line.endswith(f"{other}: --beside: no checkpoint")
+    assert line.rstrip().endswith(f"{other}: --beside: no checkpoint")
 
 
 def test_off_nominal_is_for_quadrotors(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -227,7 +227,7 @@ def test_a_long_name_is_told_by_its_end() -> None:
         task.load("hover"), flights, {"experiments/out/gallery/circle-ppo": flights, "a/b": flights}
     )
     labels = {line.get_label() for axes in figure.axes for line in axes.lines}
-    assert {"median of …/gallery/circle-ppo", "median of a/b"} <= labels
+    assert {"median of …/out/gallery/circle-ppo", "median of a/b"} <= labels
 
 
 def test_the_map_has_medians_by_tilt_and_speed() -> None:

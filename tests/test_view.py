@@ -342,7 +342,7 @@ def shown(page: Shown) -> Shown:
     """The page as it is opened."""
     if page.ask("document.getElementById('follow').checked"):
         page.find("#follow").click()
-    page.wait_for(f"qrlView.choose({STARTS[0]}, 0)")
+    browser.wait_for(page.driver, f"qrlView.choose({STARTS[0]}, 0)")
     return page
 
 
