@@ -20,7 +20,7 @@ ROOMS = {"qrl": ROOT / "src" / "qrl", "qrl_envs": ROOT / "envs" / "qrl_envs"}
 TRAINING = ("qrl.laps", "qrl_envs.env")  # what they import, and they, decide a run's numbers
 CODE = "code.sha256"  # in a run's folder: of which code it is
 
-SEEDS, FAST_SEEDS = 6, 4  # even, so that two cores share them
+SEEDS, FAST_SEEDS = 6, 2  # even, so that two cores share them
 # A device each, and no threads of XLA's besides: docs/profile.md.
 PARTED = {"JAX_NUM_CPU_DEVICES": "2", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
 PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
