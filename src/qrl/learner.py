@@ -273,15 +273,20 @@ class Learner:
 def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, batch: Transition) -> chex.Array:
     """V of what follows each step of trajectories, [B, T], where `value` is V of what precedes it.
 
-    What follows is what precedes the next step, but at ends: V is computed twice only where one lies within.
+    What follows is what precedes the next step, but at ends. So V is computed anew at the last step and at the first
+    end before it, and everywhere only where a trajectory has more of these.
     """
+    within = (batch.terminated + batch.truncated)[:, :-1] > 0
+    at = jnp.argmax(within, axis=1)  # 0 where there is none
+    first = within & (jnp.arange(within.shape[1]) == at[:, None])
 
     def shifted() -> chex.Array:
-        last = critic(batch.next_observation[:, -1:])
-        return jnp.concatenate([jax.lax.stop_gradient(value)[:, 1:], last], axis=1)
+        after = jnp.take_along_axis(batch.next_observation, at[:, None, None], axis=1)
+        anew = critic(jnp.concatenate([after, batch.next_observation[:, -1:]], axis=1))
+        before = jnp.where(first, anew[:, :1], jax.lax.stop_gradient(value)[:, 1:])
+        return jnp.concatenate([before, anew[:, 1:]], axis=1)
 
-    within = jnp.any((batch.terminated + batch.truncated)[:, :-1] > 0)
-    return jax.lax.cond(within, lambda: critic(batch.next_observation), shifted)
+    return jax.lax.cond(jnp.any(within & ~first), lambda: critic(batch.next_observation), shifted)
 
 
 def _apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:

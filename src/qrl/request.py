@@ -8,7 +8,7 @@ import jax
 from brax import envs
 from brax.envs.base import Env
 
-from qrl import runs
+from qrl import processes, runs
 from qrl.config import Config
 from qrl.runs import ConfigFile, RunConfig, TaskRecord
 from qrl.state import spread
@@ -98,9 +98,11 @@ def run_config(
         record = asked
     if not record:
         raise BadInput(f"no task given (known: {', '.join(tasks.shipped())}; all: qrl tasks)")
+    learner = _learner(record, task or str(config), config, file.learner, flags)
+    processes.suit(learner)  # the devices are asked for below
     run = RunConfig(
         task=record,
-        learner=_learner(record, task or str(config), config, file.learner, flags),
+        learner=learner,
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=runs.versions(),

@@ -31,7 +31,7 @@ def train(args: argparse.Namespace) -> int:
     with ExitStack() as until_done:
         plan: _Plan | None = None
         wrong: Exception | None = None
-        if peers.first():
+        if process.number == peers.FIRST:  # not peers.first(), which asks for the devices
             try:
                 plan = _plan(args, until_done)
             except Exception as error:  # raised once the others, who wait, have heard
