@@ -132,7 +132,7 @@ def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, 
 
     Nothing is compiled before its time is taken: rates alone, which leave compilation out, may use JAX's `cache`.
     """
-    env = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PYTHON"))}
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PJRT_", "NPROC", "PYTHON"))}
     env |= {
         "BENCH_SPAWNED": str(time.time()),
         "BENCH_BUDGET_SECONDS": str(budget_seconds),

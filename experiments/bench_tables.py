@@ -20,10 +20,11 @@ TUNED = (
     "**Whose settings.** qrl races with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
     " `circle_fast`); its commands use the presets that ship as these tasks' defaults. On hover and circle these end"
     " with the gradient of flights through the simulator (APG), which no peer here is given; a step so flown counts as"
-    " a step; *qrl without APG* is the same presets without it. Brax PPO's were tuned by hand for the pendulum, as Brax"
-    " ships none that suit; on hover and circle it has"
-    " the same with more lanes and a longer horizon, and no search was made there. rejax: its own for this task. sbx:"
-    " the RL Zoo's for this task. rltools: the package's defaults, made for this task."
+    " a step; *qrl without APG* is the same presets without it. qrl has XLA use one thread where its minibatches are"
+    " small; every other contestant has the threads that it chooses. Brax PPO's were tuned by hand for the pendulum, as"
+    " Brax ships none that suit; on hover and circle it has the same with more lanes and a longer horizon, and no"
+    " search was made there. rejax: its own for this task. sbx: the RL Zoo's for this task. rltools: the package's"
+    " defaults, made for this task."
 )
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from qrl import laps, loop, request, runs
+from qrl import laps, loop, processes, request, runs
 
 REPORT_STEPS = 1_000_000
 SETTLED = 0.25  # of the reports: what comes after is held against their end
@@ -33,6 +33,7 @@ def main() -> int:
     reports = max(4, round(args.steps / REPORT_STEPS))
     long = {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}
     run = request.run_config("hover", None, runs.ConfigFile(), long, 0, 1)
+    processes.limit_threads(run.learner)
     if args.out.exists():
         print(f"{args.out}: exists already; give another --out", file=sys.stderr)
         return 2

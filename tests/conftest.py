@@ -32,6 +32,15 @@ def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+@pytest.fixture(autouse=True)
+def _threads() -> Iterator[None]:
+    """What a command in this process says to XLA is not for the next test's processes."""
+    before = os.environ.get("PJRT_NPROC")
+    yield
+    if before is None:
+        os.environ.pop("PJRT_NPROC", None)
+
+
 def _quickly() -> Iterator[None]:
     """For what runs for milliseconds: XLA's optimisations would take twice the time of the rest."""
     before = jax.config.read("jax_disable_most_optimizations")

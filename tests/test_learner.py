@@ -21,24 +21,40 @@ def config(**changes: object) -> Config:
     return Config.model_validate(runs.preset("default") | {"normalise_observations": False} | changes, strict=False)
 
 
-def batch(seed: int = 0, ends_within: bool = True) -> Transition:
+def random_ends() -> np.ndarray:
+    return np.random.default_rng(0).random((B, T)) < 0.4  # more than one in a trajectory
+
+
+def ends_at(*steps: int) -> np.ndarray:
+    """[B, T]: trajectory i ends at the i-th of `steps`; T: not at all."""
+    return np.arange(T) == np.asarray(steps)[:, None]
+
+
+# Where trajectories end: at more steps than one (V of all that follows is computed anew) or at fewer.
+ENDS = {
+    "ends within": random_ends(),
+    "one end within": ends_at(0, T - 2, 3),
+    "one end within, one at the end": ends_at(2, T, 4) | ends_at(T - 1, T - 1, T),
+    "ends at the end": ends_at(T, T - 1, T - 1),
+}
+
+
+def batch(seed: int = 0, ended: np.ndarray = ENDS["ends within"]) -> Transition:
     """Trajectories: what follows a step is what precedes the next one, but at an end."""
     rng = np.random.default_rng(seed)
-    ended = rng.random((B, T)) < 0.4
-    if not ends_within:
-        ended = np.arange(T) == np.where(np.arange(B) > 0, T - 1, T)[:, None]
-    terminated = ended & (rng.random((B, T)) < 0.4)
+    count, steps = ended.shape
+    terminated = ended & (np.cumsum(ended).reshape(ended.shape) % 3 == 0)
     truncated = ended & ~terminated
-    observation = rng.normal(size=(B, T + 1, F))
+    observation = rng.normal(size=(count, steps + 1, F))
     values = Transition(
         observation=observation[:, :-1],
-        action=rng.normal(size=(B, T, A)),
-        log_mu=rng.normal(size=(B, T)) - 2.0,
-        reward=rng.normal(size=(B, T)),
-        next_observation=np.where(ended[..., None], rng.normal(size=(B, T, F)), observation[:, 1:]),
+        action=rng.normal(size=(count, steps, A)),
+        log_mu=rng.normal(size=ended.shape) - 2.0,
+        reward=rng.normal(size=ended.shape),
+        next_observation=np.where(ended[..., None], rng.normal(size=(count, steps, F)), observation[:, 1:]),
         terminated=terminated,
         truncated=truncated,
-        out_of_bounds=truncated & (np.cumsum(truncated) % 2 == 0).reshape(B, T),
+        out_of_bounds=truncated & (np.cumsum(truncated) % 3 == 2).reshape(ended.shape),
     )
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
 
@@ -66,10 +82,10 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
     mean = mlp(state.params.policy, d.observation * scale)
     log_pi = (-0.5 * ((d.action - mean) / c.sigma) ** 2 - np.log(c.sigma) - 0.5 * np.log(2 * np.pi)).sum(-1)
     ratio = np.exp(log_pi - d.log_mu)
-    a_trace, v_trace = np.zeros((B, T)), np.zeros((B, T))
-    for b in range(B):
+    a_trace, v_trace = np.zeros(d.reward.shape), np.zeros(d.reward.shape)
+    for b in range(len(d.reward)):
         carried = 0.0
-        for i in reversed(range(T)):
+        for i in reversed(range(d.reward.shape[1])):
             carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
             for_ever = c.reward_scale * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
             after = for_ever if d.out_of_bounds[b, i] else v_next[b, i]
@@ -94,12 +110,30 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
     ],
     ids=["paper", "scaled", "condition 3, constant margin", "condition 1", "condition 2: PPO with GAE"],
 )
-@pytest.mark.parametrize("ends_within", [True, False], ids=["ends within", "ends at the end"])
-def test_losses_are_the_papers(changes: dict, ends_within: bool) -> None:
+@pytest.mark.parametrize("ended", ENDS.values(), ids=ENDS)
+def test_losses_are_the_papers(changes: dict, ended: np.ndarray) -> None:
     """L_policy and L_value of Sec. 4 and Algorithm 1, against a literal loop, for each condition."""
-    learner, data = Learner(config(**changes), F, A), batch(ends_within=ends_within)
+    learner, data = Learner(config(**changes), F, A), batch(ended=ended)
     expected = literal_losses(learner, data, off_policy=learner.config.advantage == "pi")
     np.testing.assert_allclose(losses(learner, data), expected, rtol=2e-4)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_unrolls_may_be_short(steps: int) -> None:
+    """Of one step there is none within; of two, one."""
+    learner, data = Learner(config(), F, A), batch(ended=ENDS["one end within"][:, :steps])
+    np.testing.assert_allclose(losses(learner, data), literal_losses(learner, data, off_policy=True), rtol=2e-4)
+
+
+def test_members_side_by_side_have_their_own_ends() -> None:
+    """Under vmap, as on a GPU, a member whose V is computed anew throughout changes no other."""
+    learner = Learner(config(), F, A)
+    each = [batch(0, ENDS["ends within"]), batch(1, ENDS["one end within"])]
+    state = learner.init(jax.random.PRNGKey(1))
+    both = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    _, terms = jax.jit(jax.vmap(learner.update, in_axes=(None, 0)))(state, both)
+    for i, data in enumerate(each):
+        np.testing.assert_allclose((terms.policy_loss[i], terms.value_loss[i]), losses(learner, data), rtol=1e-5)
 
 
 def test_update_ascends_both_losses() -> None:

@@ -14,7 +14,7 @@ import numpy as np
 
 import qrl_envs  # noqa: F401 - registers our environments with Brax
 from judge import Act, Judge, pendulum_judge, success_judge
-from qrl import laps, request, runs
+from qrl import laps, processes, request, runs
 from qrl.evaluate import summarise
 from qrl.state import point, stack
 from qrl.train import Trainer
@@ -27,6 +27,7 @@ def contestant(task: str, preset: str | None, seed: int, flags: dict[str, Any]) 
     fast = f"{task}_fast"
     name = preset or (fast if fast in runs.presets() else task)
     run = request.run_config(task, None, runs.ConfigFile(learner=runs.preset(name)), flags, seed, 1)
+    processes.limit_threads(run.learner)
     env = request.environment(run.task)
     return Trainer(env, run.learner), stack([point(env, run.learner)]), run
 

@@ -276,15 +276,16 @@ def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, 
     What follows is what precedes the next step, but at ends. So V is computed anew at the last step and at the first
     end before it, and everywhere only where a trajectory has more of these.
     """
-    within = (batch.terminated + batch.truncated)[:, :-1] > 0
+    steps = jnp.arange(value.shape[1])
+    within = (batch.terminated + batch.truncated > 0) & (steps < steps[-1])
     at = jnp.argmax(within, axis=1)  # 0 where there is none
-    first = within & (jnp.arange(within.shape[1]) == at[:, None])
+    first = within & (steps == at[:, None])
 
     def shifted() -> chex.Array:
         after = jnp.take_along_axis(batch.next_observation, at[:, None, None], axis=1)
         anew = critic(jnp.concatenate([after, batch.next_observation[:, -1:]], axis=1))
-        before = jnp.where(first, anew[:, :1], jax.lax.stop_gradient(value)[:, 1:])
-        return jnp.concatenate([before, anew[:, 1:]], axis=1)
+        following = jnp.concatenate([jax.lax.stop_gradient(value)[:, 1:], anew[:, 1:]], axis=1)
+        return jnp.where(first, anew[:, :1], following)
 
     return jax.lax.cond(jnp.any(within & ~first), lambda: critic(batch.next_observation), shifted)
 

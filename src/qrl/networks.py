@@ -1,6 +1,7 @@
 """The Gaussian policy and the critic as flax modules, and the log-density of the policy."""
 
 from collections.abc import Callable
+from typing import Any
 
 import chex
 import flax.linen as nn
@@ -23,34 +24,38 @@ class MLP(nn.Module):
         for width in self.hidden:
             x = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5))(x))
         last = nn.Dense(
-            self.outputs, kernel_init=nn.initializers.orthogonal(self.final_gain), dot_general=_to_few_outputs
+            self.outputs, kernel_init=nn.initializers.orthogonal(self.final_gain), dot_general=_as_dense_calls_it
         )
         return last(x)
 
 
 @jax.custom_vjp
-def _onto(x: chex.Array, kernel: chex.Array) -> chex.Array:
+def _product(x: chex.Array, kernel: chex.Array) -> chex.Array:
+    """x @ kernel, [..., F] and [F, outputs], for few outputs; differentiable in reverse mode alone."""
     return x @ kernel
 
 
-def _onto_forward(x: chex.Array, kernel: chex.Array) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
-    return x @ kernel, (x, kernel)
+def _forward(x: chex.Array, kernel: chex.Array) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
+    return _product(x, kernel), (x, kernel)
 
 
-def _onto_backward(seen: tuple[chex.Array, chex.Array], error: chex.Array) -> tuple[chex.Array, chex.Array]:
+def _backward(seen: tuple[chex.Array, chex.Array], error: chex.Array) -> tuple[chex.Array, chex.Array]:
     x, kernel = seen
-    flat = error.reshape(-1, error.shape[-1])
-    # Kept from being merged: as [inputs, outputs] a CPU takes six times as long over it where outputs are few.
-    turned = jax.lax.optimization_barrier(flat.T @ x.reshape(-1, x.shape[-1]))
+    # The barrier keeps XLA from folding the transposition into the product: as [F, outputs] a CPU takes six times as
+    # long over it where outputs are few.
+    turned = jax.lax.optimization_barrier(error.reshape(-1, error.shape[-1]).T @ x.reshape(-1, x.shape[-1]))
     return error @ kernel.T, turned.T
 
 
-_onto.defvjp(_onto_forward, _onto_backward)
+_product.defvjp(_forward, _backward)
 
 
-def _to_few_outputs(x: chex.Array, kernel: chex.Array, *_: object, **__: object) -> chex.Array:
-    """What Dense asks of a `dot_general`: [..., F], [F, outputs] -> [..., outputs]."""
-    return _onto(x, kernel)
+def _as_dense_calls_it(
+    x: chex.Array, kernel: chex.Array, dimension_numbers: Any, precision: Any = None, **_: Any
+) -> chex.Array:
+    assert precision is None
+    assert dimension_numbers == (((x.ndim - 1,), (0,)), ((), ()))
+    return _product(x, kernel)
 
 
 def log_density(action: chex.Array, mean: chex.Array, sigma: float | chex.Array) -> chex.Array:

@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,9 @@ import jax
 from qrl.config import Config
 from qrl_envs.specfile import BadInput
 
-FEW_SAMPLES = 1000  # docs/profile.md: one thread is 1.2 to 1.4 times as fast at 400 and 800, 0.8 to 1.0 at 1,600
+# docs/profile.md: one thread is 1.2 to 1.4 times as fast at 400 and 800 samples and 64 units, 0.8 to 1.0 at 1,600.
+LITTLE_WORK = 1000 * 64**2  # multiply-adds of an update's largest product
+FEW_LANES = 512
 
 
 class Process(NamedTuple):
@@ -51,13 +53,15 @@ def _number(flag: str, value: int | str | None) -> int | None:
         raise BadInput(f"{flag}: expected a number, found '{value}'") from None
 
 
-def suit(learner: Config) -> None:
-    """Have XLA use one thread where its minibatches are small; before a device is first asked for, or in vain.
+def limit_threads(learner: Config, environment: MutableMapping[str, str] = os.environ) -> None:
+    """Have XLA use one thread of a CPU where a run's products and unrolls are small, unless its threads are set.
 
-    What a product of so few samples gains by a second core, the threads lose by waiting for each other.
+    What so little work gains by a second core, threads lose by waiting for each other. JAX reads it when it is first
+    asked for its devices: to be called before.
     """
-    if learner.minibatch_lanes * learner.unroll_steps <= FEW_SAMPLES:
-        os.environ.setdefault("PJRT_NPROC", "1")
+    work = learner.minibatch_lanes * learner.unroll_steps * max(*learner.policy_hidden, *learner.critic_hidden) ** 2
+    if work <= LITTLE_WORK and learner.lanes <= FEW_LANES and "NPROC" not in environment:
+        environment.setdefault("PJRT_NPROC", "1")
 
 
 def join(process: Process) -> None:

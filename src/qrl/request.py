@@ -8,7 +8,7 @@ import jax
 from brax import envs
 from brax.envs.base import Env
 
-from qrl import processes, runs
+from qrl import runs
 from qrl.config import Config
 from qrl.runs import ConfigFile, RunConfig, TaskRecord
 from qrl.state import spread
@@ -88,7 +88,10 @@ def _checked(record: TaskRecord, where: str) -> TaskRecord:
 def run_config(
     task: str | None, config: Path | None, file: ConfigFile, flags: dict[str, Any], seed: int | None, seeds: int | None
 ) -> RunConfig:
-    """The run asked for: flags over CONFIG (`file`, read from `config`) over the task's preset over the default."""
+    """The run asked for: flags over CONFIG (`file`, read from `config`) over the task's preset over the default.
+
+    It names no devices yet: JAX has not been asked for them.
+    """
     record = file.task
     assert not isinstance(record, str)  # config_file saw to it
     if task:
@@ -98,15 +101,13 @@ def run_config(
         record = asked
     if not record:
         raise BadInput(f"no task given (known: {', '.join(tasks.shipped())}; all: qrl tasks)")
-    learner = _learner(record, task or str(config), config, file.learner, flags)
-    processes.suit(learner)  # the devices are asked for below
     run = RunConfig(
         task=record,
-        learner=learner,
+        learner=_learner(record, task or str(config), config, file.learner, flags),
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=runs.versions(),
-        devices=device_names(),
+        devices=[],
     )
     return _countable(run, str(config or "command line"))
 

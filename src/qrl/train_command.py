@@ -10,6 +10,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn
 
@@ -31,7 +32,7 @@ def train(args: argparse.Namespace) -> int:
     with ExitStack() as until_done:
         plan: _Plan | None = None
         wrong: Exception | None = None
-        if process.number == peers.FIRST:  # not peers.first(), which asks for the devices
+        if not jax.distributed.is_initialized() or peers.first():
             try:
                 plan = _plan(args, until_done)
             except Exception as error:  # raised once the others, who wait, have heard
@@ -71,8 +72,12 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
         if loop.finished(out, config):
             console.print(f"{out}: finished already; nothing to do")
             return None
-        if changed := request.changed_since(config):
-            console.print(f"not as it began, so the bits may differ: {changed}")
+    if not jax.distributed.is_initialized():  # others, who do not know the run yet, would have other threads
+        processes.limit_threads(config.learner)
+    if not held:
+        config = config.model_copy(update={"devices": request.device_names()})
+    elif changed := request.changed_since(config):
+        console.print(f"not as it began, so the bits may differ: {changed}")
     env = request.environment(config.task)
     where = "command line" if "observation_scale" in flags else str(args.config or config.task.name)
     request.check(env, config.learner, where)
