@@ -46,7 +46,7 @@ trial() {
     return 1
   fi
   compare "$venv"
-  "$venv/bin/python" -m pytest -n 2 --dist loadfile -q -p no:cacheprovider >"$log" 2>&1 || code=$?
+  "$venv/bin/python" -m pytest -n 2 --dist worksteal -q -p no:cacheprovider >"$log" 2>&1 || code=$?
   if ((code == 0)); then
     echo "newest: $1: held: $(tail -n 1 "$log")"
   else

@@ -90,8 +90,8 @@ def workers() -> list[Any]:
     """The device of each worker: an accelerator has one; a CPU one for each core that this process may use.
 
     A program of ours keeps about one core busy, and the CPU runs several programs at a time: they need no devices of
-    their own, and so the program is the one that a single run compiles, and its results are the same bits where that has
-    as many threads.
+    their own, and so the program is the one that a single run compiles, and its results are the same bits where that
+    has as many threads.
     """
     devices = jax.local_devices()
     return devices if devices[0].platform != "cpu" else devices[:1] * _cores()
