@@ -40,10 +40,10 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     task = request.spec(config.task)
     assert isinstance(task, QuadrotorTask)
     one = config.member(0)
-    trainer, state, env_steps = restore.last(request.environment(config.task), one, runs.members(folder, config)[0])
+    trainer, learner, env_steps = restore.last(request.environment(config.task), one, runs.members(folder, config)[0])
     if trial:
         trainer = Trainer(OffNominal(task, conditions(task)["trial"]), config.learner)
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)[:starts]
-    found = trainer.fly(state.learner, stack([point(trainer.env, config.learner)]), keys)
+    found = trainer.fly(learner, stack([point(trainer.env, config.learner)]), keys)
     found = jax.tree.map(lambda x: np.asarray(x)[0], found)
     return Flown(one.seed, env_steps, task, found.observations, found.measures)

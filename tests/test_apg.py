@@ -12,14 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from qrl import apg, laps, request, restore, runs
+from campaign import assert_same_leaves, leaves
+from qrl import apg, checkpoint, laps, request, runs
 from qrl.config import Config
 from qrl.learner import Learner, LearnerState
 from qrl.state import point, stack
 from qrl.train import Trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
-from test_loop import assert_same, last_state, metrics, run_config, train
+from test_loop import metrics, run_config, train
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
@@ -287,10 +288,10 @@ def test_an_environment_without_a_gradient_is_told_before_training() -> None:
 def test_stopped_among_the_climbs_it_goes_on_to_the_same_bits(tmp_path: Path, whole: Path, stop_after: int) -> None:
     env, run = worlds.make("pendulum"), run_config(**CLIMBING)
     train(tmp_path, run, env, stop_after=stop_after)
-    _, _, reached = restore.last(env, run, tmp_path)
+    reached = checkpoint.steps(tmp_path)[0]
     assert 720 < reached < 1200
     train(tmp_path, run, env, resume=True)
-    assert_same(last_state(tmp_path, run, env), last_state(whole, run, env))
+    assert_same_leaves(leaves(tmp_path), leaves(whole))
     assert metrics(tmp_path) == metrics(whole)
 
 

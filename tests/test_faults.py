@@ -6,7 +6,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -278,6 +278,25 @@ def victim(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 LIKE = {"weights": jax.ShapeDtypeStruct((2, 3), np.float32), "step": jax.ShapeDtypeStruct((), np.int32)}
+
+
+class Part(NamedTuple):
+    weights: Any = None
+    step: Any = None
+    bias: Any = None
+
+
+def test_a_part_is_read_alone(victim: Path) -> None:
+    """What is asked for, whatever lies beside it; where that is not as expected, or not there, it is said."""
+
+    def read(part: Part) -> Part:
+        return checkpoint.read(victim, run_config(), 7, part).state
+
+    np.testing.assert_array_equal(read(Part(weights=LIKE["weights"])).weights, np.arange(6).reshape(2, 3))
+    assert read(Part(step=LIKE["step"])) == Part(step=7)
+    for part in (Part(weights=jax.ShapeDtypeStruct((3, 2), np.float32)), Part(bias=LIKE["step"])):
+        with pytest.raises(Foreign, match="of another version of qrl"):
+            read(part)
 
 
 def read_or_complaint(folder: Path) -> Checkpoint | str:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
+from campaign import assert_same_leaves, leaves
 from qrl import checkpoint, laps, loop, restore, runs
 from qrl.config import Config
 from qrl.runs import RunConfig, TaskRecord
@@ -71,16 +72,6 @@ def metrics(folder: Path) -> list[dict[str, str]]:
         ]
 
 
-def last_state(folder: Path, run: RunConfig, env: Env) -> list[np.ndarray]:
-    _, state, _ = restore.last(env, run, folder)
-    return [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
-
-
-def assert_same(first: list[np.ndarray], second: list[np.ndarray]) -> None:
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a, b)
-
-
 @pytest.fixture(scope="module")
 def pendulum() -> Env:
     return worlds.make("pendulum")
@@ -107,7 +98,7 @@ def test_resumed_run_equals_one_never_stopped(tmp_path: Path, pendulum: Env, who
     events = train(tmp_path, run_config(), pendulum, stop_after=stop_after)
     assert not any(isinstance(e, loop.Reported) and e.rows[0]["env_steps"] == 1200 for e in events)
     train(tmp_path, run_config(), pendulum, resume=True)
-    assert_same(last_state(tmp_path, run_config(), pendulum), last_state(whole, run_config(), pendulum))
+    assert_same_leaves(leaves(tmp_path), leaves(whole))
     assert metrics(tmp_path) == metrics(whole)
 
 
@@ -136,19 +127,19 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, who
     train(tmp_path / "pair", pair, pendulum)
     train(tmp_path / "one", run_config(seed=1), pendulum)
     for seed, single in ((0, whole), (1, tmp_path / "one")):
-        folder, run = tmp_path / "pair" / f"seed-{seed}", run_config(seed=seed)
-        assert_same(last_state(folder, run, pendulum), last_state(single, run, pendulum))
+        folder = tmp_path / "pair" / f"seed-{seed}"
+        assert_same_leaves(leaves(folder), leaves(single))
         assert metrics(folder) == metrics(single)
 
 
 @pytest.mark.usefixtures("quick_compilation")
-@pytest.mark.parametrize("task", ["pendulum", "hover", "circle"])
+@pytest.mark.parametrize("task", ["pendulum", "circle"])
 def test_the_same_seed_gives_the_same_bits_twice(tmp_path: Path, task: str) -> None:
     """State, ring, lanes and metrics."""
     env, run = worlds.make(task), run_config(steps=400)
     for name in ("first", "again"):
         train(tmp_path / name, run, env)
-    assert_same(last_state(tmp_path / "first", run, env), last_state(tmp_path / "again", run, env))
+    assert_same_leaves(leaves(tmp_path / "first"), leaves(tmp_path / "again"))
     assert metrics(tmp_path / "first") == metrics(tmp_path / "again")
 
 
@@ -175,7 +166,7 @@ def test_nan_stops_the_run_and_keeps_the_last_good_checkpoint(tmp_path: Path) ->
     env = Poisoned(bad=100.0)
     with pytest.raises(laps.NotFinite, match=r"reward is not finite in update 18; the checkpoint at step 400 is kept"):
         train(tmp_path, run_config(), env)
-    assert all(np.isfinite(leaf).all() for leaf in last_state(tmp_path, run_config(), env))
+    assert all(np.isfinite(leaf).all() for leaf in leaves(tmp_path).values())
     assert [row["env_steps"] for row in runs.read_metrics(tmp_path)] == [200, 400]
 
 

@@ -346,6 +346,14 @@ def shown(page: Shown) -> Shown:
     return page
 
 
+@pytest.fixture
+def small_window(shown: Shown) -> Iterator[None]:
+    """For what plays: a processor draws it, pixel by pixel."""
+    browser.size(shown.driver, 480, 360)
+    yield
+    browser.size(shown.driver, browser.WIDTH, browser.HEIGHT)
+
+
 def parts_of(pixels: Array) -> int:
     """How many colours there are."""
     return len(np.unique(pixels.reshape(-1, 3), axis=0))
@@ -404,7 +412,7 @@ def test_scrubbing_moves_all_of_it(shown: Shown) -> None:
 
 
 @pytest.mark.parametrize("page", ["hover"], indirect=True, scope="module")
-def test_it_plays_and_pauses(shown: Shown) -> None:
+def test_it_plays_and_pauses(shown: Shown, small_window: None) -> None:
     def rate(text: str) -> None:
         Select(shown.find("#rate")).select_by_visible_text(text)
         shown.driver.execute_script("document.activeElement.blur()")
@@ -500,4 +508,4 @@ def test_it_fits_the_window(shown: Shown) -> None:
             drawing, caption = shown.find("#scene .main-svg").rect, shown.find("#scale").rect
             assert drawing["y"] + drawing["height"] <= caption["y"] + 1
     finally:
-        browser.size(shown.driver, 1280, 800)
+        browser.size(shown.driver, browser.WIDTH, browser.HEIGHT)

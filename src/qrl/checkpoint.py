@@ -43,6 +43,7 @@ def steps(folder: Path) -> list[int]:
 def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
     """The checkpoint of `run` at `env_steps`; `like` gives structure, shapes and types of a member's state.
 
+    Fields of `like` that are None are not read, and nothing is said of what is saved there.
     Raises Damaged where the files are not those that were sealed, Foreign where they are of another run or version.
     """
     path = _root(folder) / str(env_steps)
@@ -51,13 +52,19 @@ def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
         raise Foreign(f"{path}: of another run than config.json (another task, hyperparameter, seed or version of qrl)")
     wanted = _by_name(like)
     try:
-        with ocp.StandardCheckpointer(multiprocessing_options=_ONE_PROCESS) as orbax:
-            found = orbax.restore((path / STATE).resolve(), wanted)
+        handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=_ONE_PROCESS)
+        with ocp.Checkpointer(handler, multiprocessing_options=_ONE_PROCESS) as orbax:
+            as_saved = ocp.checkpoint_utils.construct_restore_args(wanted)
+            partial = any(field is None for field in like)
+            what = ocp.args.PyTreeRestore(wanted, restore_args=as_saved, partial_restore=partial)
+            found = orbax.restore((path / STATE).resolve(), args=what)
     except OSError as error:
         raise Damaged(f"{path}: cannot be read ({first_line(error)})") from None
     except (ValueError, KeyError, TypeError) as error:
         raise Foreign(f"{path}: of another version of qrl ({first_line(error)})") from None
-    for name, leaf in wanted.items():  # Orbax hands back whatever it finds
+    for name, leaf in wanted.items():  # Orbax hands back whatever it finds, and of a part what it was asked for
+        if isinstance(found[name], jax.ShapeDtypeStruct):
+            raise Foreign(f"{path}: of another version of qrl (there is no {name})")
         if (found[name].shape, found[name].dtype) != (leaf.shape, leaf.dtype):
             raise Foreign(
                 f"{path}: of another version of qrl ({name} is {found[name].dtype}{list(found[name].shape)},"

@@ -51,7 +51,7 @@ class Run:
             raise BadInput(f"{folder}: holds {self.config.seeds} seeds; name one of them, such as RUN={one}")
         self.env: Env = request.environment(self.config.task)
         try:
-            self.trainer, self.state, self.env_steps = restore.last(self.env, self.config, folder)
+            self.trainer, self.learner, self.env_steps = restore.last(self.env, self.config, folder)
         except OSError as error:
             raise BadInput(str(error)) from None
         self._task = request.spec(self.config.task) if self.config.task.spec else None
@@ -60,7 +60,7 @@ class Run:
     def fly(self, starts: chex.PRNGKey) -> Flights:
         """Flights of the float policy as `qrl evaluate` makes them; leading axis: starts."""
         points = stack([point(self.env, self.config.learner)])
-        return jax.tree.map(lambda x: np.asarray(x[0]), self.trainer.fly(self.state.learner, points, starts))
+        return jax.tree.map(lambda x: np.asarray(x[0]), self.trainer.fly(self.learner, points, starts))
 
     def fly_with(self, policy: Policy, answer: Answer, starts: chex.PRNGKey, envelope: float = 0.0) -> Flights:
         """Flights with `answer` in the policy's place; the last starts, that fraction, are of the envelope."""
@@ -91,7 +91,7 @@ class Run:
     def policy(self) -> Policy:
         """The policy that ships, with observations of its own flights to calibrate on."""
         config, learner = self.config.learner, self.trainer.learner
-        shipped = jax.tree.map(lambda x: np.asarray(x[0], np.float64), learner.shipped(self.state.learner))
+        shipped = jax.tree.map(lambda x: np.asarray(x[0], np.float64), learner.shipped(self.learner))
         layers = shipped.params.policy["params"]
         size = learner.observation_size
         observed, acted = self._ports()

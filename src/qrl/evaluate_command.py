@@ -110,8 +110,7 @@ def _saved(run: Run, seed: int, most: int) -> Iterator[tuple[Any, int]]:
     """Learner and environment steps of a seed's checkpoints, newest first."""
     folder = runs.members(run.folder, run.config)[seed]
     try:
-        for state, env_steps in restore.newest(run.policies.trainer, run.config.member(seed), folder, most):
-            yield state.learner, env_steps
+        yield from restore.newest(run.policies.trainer.learner, run.config.member(seed), folder, most)
     except OSError as error:
         raise BadInput(str(error)) from None
 

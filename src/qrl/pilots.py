@@ -87,7 +87,7 @@ def _each_kind(worlds: Worlds, compiling: Callable[[Env], Future]) -> dict[str, 
 
 def _compiled_policy(env: Env, config: Config, starts: chex.PRNGKey) -> Program:
     trainer, points = Trainer(env, config), stack([point(env, config)])
-    return trainer.fly.lower(restore.shapes(trainer, points).learner, points, starts).compile()
+    return trainer.fly.lower(restore.learner_shapes(trainer.learner, 1), points, starts).compile()
 
 
 def _controllers(task: QuadrotorTask) -> dict[str, Callable[[chex.Array], chex.Array]]:

@@ -5,12 +5,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from brax.envs.base import Env
 
 from qrl import checkpoint, laps
+from qrl.learner import Learner, LearnerState
 from qrl.runs import RunConfig
 from qrl.seal import Damaged, Record
-from qrl.state import Point, TrainState, point, stack
+from qrl.state import Point, TrainState, stack
 from qrl.train import Trainer
 
 
@@ -53,28 +55,35 @@ def latest(folders: list[Path], configs: list[RunConfig], like: TrainState) -> R
     return Restored(env_steps, states, [each.record for each in found], notes)
 
 
-def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, TrainState, int]:
-    """Trainer, state (leading axis: one member) and environment steps of a seed's last checkpoint.
+def learner_shapes(learner: Learner, members: int) -> LearnerState:
+    """The learners' part of `shapes`, for which no environment is traced."""
+    one = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((members, *x.shape), x.dtype), one)
+
+
+def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, LearnerState, int]:
+    """Trainer, learner (leading axis: one member) and environment steps of a seed's last checkpoint.
 
     Raises FileNotFoundError, naming the folder, where there is none; OSError where it is not whole: whoever flies a
     policy should not be given an earlier one unasked.
     """
     trainer = Trainer(env, run.learner)
-    return trainer, *next(newest(trainer, run, folder, 1))
+    return trainer, *next(newest(trainer.learner, run, folder, 1))
 
 
-def newest(trainer: Trainer, run: RunConfig, folder: Path, most: int) -> Iterator[tuple[TrainState, int]]:
-    """State and environment steps, as from `last`, of a seed's checkpoints, newest first, of at most so many.
+def newest(learner: Learner, run: RunConfig, folder: Path, most: int) -> Iterator[tuple[LearnerState, int]]:
+    """Learner and environment steps, as from `last`, of a seed's checkpoints, newest first, of at most so many.
 
     Each is read when it is asked for, and raises as `last` does.
     """
     saved = checkpoint.steps(folder)
     if not saved:
         raise FileNotFoundError(f"{folder}: no checkpoint")
-    like = _one(shapes(trainer, stack([point(trainer.env, run.learner)])))
+    nothing: Any = [None] * len(TrainState._fields)
+    like = TrainState(*nothing)._replace(learner=_one(learner_shapes(learner, 1)))
     for env_steps in saved[:most]:
         found = checkpoint.read(folder, run, env_steps, like)
-        yield trainer.place(stack([found.state])), found.env_steps
+        yield jax.tree.map(jnp.array, stack([found.state.learner])), found.env_steps
 
 
 def _one(states: Any) -> Any:

@@ -73,8 +73,8 @@ def _flown(trainer: Trainer, config: RunConfig, folder: Path, starts: list[int])
     even = np.resize(starts, -(-len(starts) // LANES) * LANES)
     points = stack([point(trainer.env, config.learner)])
     try:
-        state, env_steps = next(restore.newest(trainer, config, folder, 1))
+        learner, env_steps = next(restore.newest(trainer.learner, config, folder, 1))
     except OSError as error:
         raise BadInput(str(error)) from None
-    flights = trainer.fly(state.learner, points, keys[even])
+    flights = trainer.fly(learner, points, keys[even])
     return env_steps, jax.tree.map(lambda x: np.asarray(x[0])[: len(starts)], flights)
