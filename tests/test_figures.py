@@ -284,7 +284,7 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
 
     def untrained(env: Any, *_: object) -> tuple[Trainer, Any, int]:
         trainer = Trainer(env, config.learner)
-        return trainer, trainer.init(seeds(0, 1), stack([point(env, config.learner)])), 7
+        return trainer, trainer.init(seeds(0, 1), stack([point(env, config.learner)])).learner, 7
 
     monkeypatch.setattr(restore, "last", untrained)
     trial, nominal = (figure_flights.flown(folder, trial=trial, starts=2) for trial in (True, False))
