@@ -93,8 +93,8 @@ gallery: $(STAMP)
 bench: $(STAMP)
 	@exec $(VENV)/bin/python experiments/bench.py $(ARGS)
 
-# Two processes: on the two cores that the ten minutes are promised for. Each begins with half of the files, whose
-# tests share what they train; one that is done takes over tests of the other.
+# Two processes: on the two cores that the ten minutes are promised for. Each begins with half of the tests, those of a
+# file together, for they share what they train; one that is done takes over tests of the other.
 WORKERS := -n 2 --dist worksteal
 
 test: $(STAMP)

@@ -287,16 +287,35 @@ class Part(NamedTuple):
 
 
 def test_a_part_is_read_alone(victim: Path) -> None:
-    """What is asked for, whatever lies beside it; where that is not as expected, or not there, it is said."""
+    """What is asked for, whatever lies beside it."""
 
     def read(part: Part) -> Part:
-        return checkpoint.read(victim, run_config(), 7, part).state
+        return checkpoint.read(victim, run_config(), 7, part, part=True).state
 
     np.testing.assert_array_equal(read(Part(weights=LIKE["weights"])).weights, np.arange(6).reshape(2, 3))
     assert read(Part(step=LIKE["step"])) == Part(step=7)
-    for part in (Part(weights=jax.ShapeDtypeStruct((3, 2), np.float32)), Part(bias=LIKE["step"])):
-        with pytest.raises(Foreign, match="of another version of qrl"):
-            read(part)
+
+
+@pytest.mark.parametrize("part", [False, True])
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"weights": jax.ShapeDtypeStruct((3, 2), np.float32)}, r"weights is float32\[2, 3\], not float32\[3, 2\]"),
+        ({"step": jax.ShapeDtypeStruct((), np.float32)}, r"step is int32\[\], not float32\[\]"),
+        ({"bias": jax.ShapeDtypeStruct((), np.int32)}, "bias"),
+        ({"weights": {"kernel": jax.ShapeDtypeStruct((2, 3), np.float32)}}, "weights"),
+    ],
+)
+def test_another_state_is_foreign(victim: Path, change: dict[str, Any], says: str, part: bool) -> None:
+    """Another shape, another type, a leaf that is not there or has another name, in all of it or in a part."""
+    with pytest.raises(Foreign, match=f"of another version of qrl.*{says}"):
+        checkpoint.read(victim, run_config(), 7, {**LIKE, **change}, part=part)
+
+
+def test_a_resume_leaves_nothing_unread(victim: Path) -> None:
+    with pytest.raises(Foreign, match=r"of another version of qrl.*weights"):
+        checkpoint.read(victim, run_config(), 7, {"step": LIKE["step"]})
+    assert checkpoint.read(victim, run_config(), 7, {"step": LIKE["step"]}, part=True).state == {"step": 7}
 
 
 def read_or_complaint(folder: Path) -> Checkpoint | str:

@@ -296,6 +296,11 @@ class Shown:
     def find(self, css: str) -> Any:
         return self.driver.find_element(By.CSS_SELECTOR, css)
 
+    def size(self, width: int, height: int) -> None:
+        """Until the drawing fills the new window."""
+        browser.size(self.driver, width, height)
+        self.until("document.querySelector('#scene .main-svg').clientWidth === $('scene').clientWidth")
+
     def pixels(self, css: str) -> Array:
         """What an element looks like, [height, width, 3] of 0 … 255."""
         browser.wait_for(self.driver, browser.NEXT_FRAME)
@@ -331,7 +336,7 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
 @pytest.fixture(scope="module")
 def page(chromium: webdriver.Chrome, build: Build, request: pytest.FixtureRequest) -> Shown:
-    """Loading takes longest: once for all tests of a page, which pytest runs one after the other."""
+    """Loading takes longest: once for all tests of a page, where one process runs them."""
     page = Shown(chromium, build(request.param))
     page.open()
     return page
@@ -349,9 +354,9 @@ def shown(page: Shown) -> Shown:
 @pytest.fixture
 def small_window(shown: Shown) -> Iterator[None]:
     """For what plays: a processor draws it, pixel by pixel."""
-    browser.size(shown.driver, 480, 360)
+    shown.size(480, 360)
     yield
-    browser.size(shown.driver, browser.WIDTH, browser.HEIGHT)
+    shown.size(browser.WIDTH, browser.HEIGHT)
 
 
 def parts_of(pixels: Array) -> int:
@@ -497,8 +502,7 @@ def test_it_fits_the_window(shown: Shown) -> None:
     """A laptop's, and then a phone's, on which a page scrolls."""
     try:
         for width, height in ((1280, 800), (390, 844)):
-            browser.size(shown.driver, width, height)
-            shown.until("document.querySelector('#scene .main-svg').clientWidth === $('scene').clientWidth")
+            shown.size(width, height)
             page = shown.ask("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]")
             assert page[0] <= width
             assert page[1] <= height or width == 390
@@ -508,4 +512,4 @@ def test_it_fits_the_window(shown: Shown) -> None:
             drawing, caption = shown.find("#scene .main-svg").rect, shown.find("#scale").rect
             assert drawing["y"] + drawing["height"] <= caption["y"] + 1
     finally:
-        browser.size(shown.driver, browser.WIDTH, browser.HEIGHT)
+        shown.size(browser.WIDTH, browser.HEIGHT)

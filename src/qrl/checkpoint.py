@@ -31,7 +31,7 @@ _ONE_PROCESS = ocp.options.MultiprocessingOptions(primary_host=0, active_process
 
 class Checkpoint(NamedTuple):
     env_steps: int
-    state: Any  # one member's, in NumPy
+    state: Any  # one member's, in NumPy; of a part that was read, None for the rest
     record: Record
 
 
@@ -40,10 +40,10 @@ def steps(folder: Path) -> list[int]:
     return sorted(int(path.parent.name) for path in _root(folder).glob(f"*/{seal.NAME}") if _is_step(path.parent))[::-1]
 
 
-def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
+def read(folder: Path, run: RunConfig, env_steps: int, like: Any, *, part: bool = False) -> Checkpoint:
     """The checkpoint of `run` at `env_steps`; `like` gives structure, shapes and types of a member's state.
 
-    Fields of `like` that are None are not read, and nothing is said of what is saved there.
+    With `part`, fields of `like` that are None are not read, and nothing is said of what is saved there.
     Raises Damaged where the files are not those that were sealed, Foreign where they are of another run or version.
     """
     path = _root(folder) / str(env_steps)
@@ -52,19 +52,12 @@ def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
         raise Foreign(f"{path}: of another run than config.json (another task, hyperparameter, seed or version of qrl)")
     wanted = _by_name(like)
     try:
-        handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=_ONE_PROCESS)
-        with ocp.Checkpointer(handler, multiprocessing_options=_ONE_PROCESS) as orbax:
-            as_saved = ocp.checkpoint_utils.construct_restore_args(wanted)
-            partial = any(field is None for field in like)
-            what = ocp.args.PyTreeRestore(wanted, restore_args=as_saved, partial_restore=partial)
-            found = orbax.restore((path / STATE).resolve(), args=what)
+        found = _restored((path / STATE).resolve(), wanted, part)
     except OSError as error:
         raise Damaged(f"{path}: cannot be read ({first_line(error)})") from None
     except (ValueError, KeyError, TypeError) as error:
         raise Foreign(f"{path}: of another version of qrl ({first_line(error)})") from None
-    for name, leaf in wanted.items():  # Orbax hands back whatever it finds, and of a part what it was asked for
-        if isinstance(found[name], jax.ShapeDtypeStruct):
-            raise Foreign(f"{path}: of another version of qrl (there is no {name})")
+    for name, leaf in wanted.items():  # Orbax hands back whatever it finds
         if (found[name].shape, found[name].dtype) != (leaf.shape, leaf.dtype):
             raise Foreign(
                 f"{path}: of another version of qrl ({name} is {found[name].dtype}{list(found[name].shape)},"
@@ -72,6 +65,25 @@ def read(folder: Path, run: RunConfig, env_steps: int, like: Any) -> Checkpoint:
             )
     state = jax.tree.unflatten(jax.tree.structure(like), [np.asarray(found[name]) for name in wanted])
     return Checkpoint(env_steps, state, whole.record)
+
+
+def _restored(path: Path, wanted: dict[str, Any], part: bool) -> dict[str, Any]:
+    """What is saved under the names `wanted`; ValueError where there are others, of a part in its fields."""
+    asked = {_field(name) for name in wanted}
+    # As it was saved: Orbax would turn one type into another.
+    as_saved = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), wanted)
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=_ONE_PROCESS)
+    with ocp.Checkpointer(handler, multiprocessing_options=_ONE_PROCESS) as orbax:
+        saved = handler.metadata(path).tree  # pyright: ignore[reportArgumentType]
+        there = {name for name in saved if not part or _field(name) in asked}
+        if differing := there ^ wanted.keys():  # of a part, Orbax would hand back what it was asked for, or less
+            raise ValueError(f"{min(differing)} is {'missing' if min(differing) in wanted else 'unknown'}")
+        return orbax.restore(path, args=ocp.args.PyTreeRestore(wanted, restore_args=as_saved, partial_restore=part))
+
+
+def _field(name: str) -> str:
+    """Of a leaf's name, the field of the state in which it is."""
+    return name.split(".")[0]
 
 
 def _by_name(tree: Any) -> dict[str, Any]:

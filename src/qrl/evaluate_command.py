@@ -14,6 +14,7 @@ from qrl import checkpoint, evaluate_table, request, restore, runs
 from qrl.deploy import EVALUATION_STARTS_SEED
 from qrl.evaluate import Flights, summarise
 from qrl.exits import DONE
+from qrl.learner import LearnerState
 from qrl.pilots import CONTROLLERS, NOMINAL, Baselines, Policies, Worlds
 from qrl.runs import RunConfig
 from qrl.terminal import console
@@ -106,7 +107,7 @@ def _judged(config: RunConfig) -> dict[str, Any]:
     return {key: value for key, value in (config.task.spec or {}).items() if key not in own}
 
 
-def _saved(run: Run, seed: int, most: int) -> Iterator[tuple[Any, int]]:
+def _saved(run: Run, seed: int, most: int) -> Iterator[tuple[LearnerState, int]]:
     """Learner and environment steps of a seed's checkpoints, newest first."""
     folder = runs.members(run.folder, run.config)[seed]
     try:

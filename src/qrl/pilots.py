@@ -87,7 +87,9 @@ def _each_kind(worlds: Worlds, compiling: Callable[[Env], Future]) -> dict[str, 
 
 def _compiled_policy(env: Env, config: Config, starts: chex.PRNGKey) -> Program:
     trainer, points = Trainer(env, config), stack([point(env, config)])
-    return trainer.fly.lower(restore.learner_shapes(trainer.learner, 1), points, starts).compile()
+    one = restore.learner_shapes(trainer.learner)
+    learners = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), one)
+    return trainer.fly.lower(learners, points, starts).compile()
 
 
 def _controllers(task: QuadrotorTask) -> dict[str, Callable[[chex.Array], chex.Array]]:

@@ -1,4 +1,4 @@
-"""From a run folder's checkpoints back to a training state: to go on with, or to look at."""
+"""From a run folder's checkpoints back to a training state, to go on with, or to its learner alone, to fly."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,10 +55,11 @@ def latest(folders: list[Path], configs: list[RunConfig], like: TrainState) -> R
     return Restored(env_steps, states, [each.record for each in found], notes)
 
 
-def learner_shapes(learner: Learner, members: int) -> LearnerState:
-    """The learners' part of `shapes`, for which no environment is traced."""
-    one = jax.eval_shape(learner.init, jax.random.PRNGKey(0))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((members, *x.shape), x.dtype), one)
+def learner_shapes(learner: Learner) -> LearnerState:
+    """Shapes and types of one member's learner, for which no environment is traced."""
+    return jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), jax.eval_shape(learner.init, jax.random.PRNGKey(0))
+    )
 
 
 def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, LearnerState, int]:
@@ -80,9 +81,9 @@ def newest(learner: Learner, run: RunConfig, folder: Path, most: int) -> Iterato
     if not saved:
         raise FileNotFoundError(f"{folder}: no checkpoint")
     nothing: Any = [None] * len(TrainState._fields)
-    like = TrainState(*nothing)._replace(learner=_one(learner_shapes(learner, 1)))
+    like = TrainState(*nothing)._replace(learner=learner_shapes(learner))
     for env_steps in saved[:most]:
-        found = checkpoint.read(folder, run, env_steps, like)
+        found = checkpoint.read(folder, run, env_steps, like, part=True)
         yield jax.tree.map(jnp.array, stack([found.state.learner])), found.env_steps
 
 
