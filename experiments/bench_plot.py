@@ -1,6 +1,7 @@
 """The ratios as one picture: how many times qrl's time a peer takes, or how many times its rate qrl reaches."""
 
 import math
+import textwrap
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,10 +77,12 @@ def plot(path: Path, runs: list[Run]) -> None:
         )
     axes.set_xscale("log")
     axes.axvline(1.0, color="#333333", linewidth=1.0)
-    axes.set_yticks(range(len(found)), [bar.label for bar in found], fontsize=8)
+    axes.set_yticks(range(len(found)), [textwrap.fill(bar.label, 48) for bar in found], fontsize=8)
     axes.invert_yaxis()
     axes.margins(x=0.12, y=0.01)
-    axes.set_xlabel("times qrl (median, range over seeds); hatched: not solved within the budget, so at least this")
+    axes.set_xlabel(
+        "times qrl (median, range over seeds)\nhatched: not solved within the budget, so at least this", fontsize=9
+    )
     kinds = [kind for kind in COLOURS if any(bar.kind == kind for bar in found)]
     patches = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[kind]) for kind in kinds]
     axes.legend(
@@ -87,7 +90,7 @@ def plot(path: Path, runs: list[Run]) -> None:
         [NAMES[kind] for kind in kinds],
         fontsize=8,
         loc="upper center",
-        bbox_to_anchor=(0.4, -0.9 / (0.3 * len(found))),
+        bbox_to_anchor=(0.4, -1.1 / (0.3 * len(found))),
     )
     axes.spines[["top", "right"]].set_visible(False)
     figure.savefig(path, dpi=150)
