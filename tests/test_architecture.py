@@ -45,6 +45,7 @@ FLOORS: dict[str, dict[str, int]] = {
         "vtrace": 1,
         "objective": 1,
         "buffer": 1,
+        "statistics": 1,
         "policy": 1,
         "export": 1,
         "peers": 2,
@@ -88,7 +89,7 @@ FLOORS: dict[str, dict[str, int]] = {
 ALLOWED: list[set[str] | None] = [
     {"jax", "numpy", "chex", "flax.struct", "pydantic"},
     {"flax", "scipy"},
-    {"brax", "optax"},
+    {"brax", "optax", "wrapt"},
     {"orbax", "matplotlib", "tensorboardX"},
     None,
 ]

@@ -1,6 +1,9 @@
 """The tasks as Brax environments: through Brax's own registry, wrappers and PPO."""
 
+import dataclasses
 import functools
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -82,6 +85,36 @@ def test_importing_registers_every_shipped_task() -> None:
     """`import qrl_envs` alone, under the names of the task files."""
     assert qrl_envs.__name__ == "qrl_envs"
     assert set(task.shipped()) <= set(envs._envs)
+
+
+def test_it_is_an_environment_of_braxs(any_world: World) -> None:
+    """By its type, and by the fields of its state, with their defaults."""
+    assert isinstance(any_world.env, Env)
+    ours, theirs = (dataclasses.fields(kind) for kind in (env.State, State))
+    assert [(f.name, f.default, f.default_factory) for f in ours] == [
+        (f.name, f.default, f.default_factory) for f in theirs
+    ]
+
+
+ORDERS = {
+    "ours first": "import qrl_envs; from brax import envs",
+    "Brax first": "from brax import envs; import qrl_envs",
+    "a part of ours": "import qrl_envs.conditions, brax.envs as envs",
+}
+
+
+@pytest.mark.parametrize("imports", ORDERS.values(), ids=ORDERS.keys())
+def test_it_is_registered_whichever_is_imported_first(imports: str) -> None:
+    program = f"{imports}; print(isinstance(envs.get_environment('hover'), envs.Env))"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert said.splitlines()[-1] == "True"
+
+
+def test_without_brax_none_of_it_is_imported() -> None:
+    """Nor what it brings along: its physics takes most of its time."""
+    program = "import sys, qrl_envs.conditions; print({'brax', 'mujoco'} & set(sys.modules))"
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert said == "set()\n"
 
 
 def test_sizes_are_designs(any_world: World) -> None:

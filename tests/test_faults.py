@@ -409,16 +409,18 @@ def test_seal_that_names_other_files(victim: Path, name: str) -> None:
 @settings(deadline=None)
 @given(st.one_of(st.integers(), st.integers(2), st.floats(), st.booleans(), st.sampled_from([10**4299, 1e400])))
 def test_seal_of_another_format(victim: Path, number: float) -> None:
-    """A later one is said to be later."""
+    """It is not read, but for the number itself."""
     seal = json.loads(sealed(victim))
     seal["format"] = number
-    assert with_seal(victim, json.dumps(seal).encode()) == (type(number) in (int, float, bool) and number == 1)
+    assert with_seal(victim, json.dumps(seal).encode()) == (type(number) in (int, float) and number == FORMAT)
 
 
 @pytest.mark.parametrize("depth", [10, 1_000, 100_000])
-@pytest.mark.parametrize("begin", ["[", '{"a":', '{"format":1,"record":[', '{"format":1,"sha256":{"a":['])
+@pytest.mark.parametrize(
+    "begin", ["[", '{"a":', f'{{"format":{FORMAT},"record":[', f'{{"format":{FORMAT},"sha256":{{"a":[']
+)
 def test_seal_of_great_depth(victim: Path, depth: int, begin: str) -> None:
-    assert not with_seal(victim, (begin * depth).encode())
+    assert not with_seal(victim, (begin.replace("FORMAT", str(FORMAT)) * depth).encode())
 
 
 @settings(deadline=None)
@@ -481,14 +483,17 @@ def test_resume_of_something_else_touches_nothing(
     assert campaign.digest(stopped) == before
 
 
-def test_checkpoint_of_a_later_format_touches_nothing(capfd: pytest.CaptureFixture[str], stopped: Path) -> None:
+@pytest.mark.parametrize(("number", "when"), [(FORMAT + 1, "a later"), (FORMAT - 1, "an earlier")])
+def test_checkpoint_of_another_format_touches_nothing(
+    capfd: pytest.CaptureFixture[str], stopped: Path, number: int, when: str
+) -> None:
     """This version must not read it, and must not take it for a damaged one either."""
     seal = newest(stopped) / NAME
     data = json.loads(seal.read_text())
-    seal.write_text(json.dumps({**data, "format": FORMAT + 1, "more": []}))
+    seal.write_text(json.dumps({**data, "format": number, "more": []}))
     before = campaign.digest(stopped)
-    FAULTS.append("later format")
-    assert "later version of qrl (format 2" in refused(capfd, *TRAIN, "--out", stopped, "--resume")
+    FAULTS.append("another format")
+    assert f"of {when} version of qrl (format {number};" in refused(capfd, *TRAIN, "--out", stopped, "--resume")
     assert campaign.digest(stopped) == before
 
 

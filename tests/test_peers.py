@@ -13,7 +13,7 @@ import pytest
 import campaign
 from campaign import TORTURE
 from qrl import checkpoint
-from qrl.seal import NAME
+from qrl.seal import FORMAT, NAME
 
 SURVIVOR_SECONDS = 60.0  # in which the other has to end
 STEPS = 32_000
@@ -89,7 +89,7 @@ def test_a_refused_checkpoint_leaves_nobody_waiting(tmp_path: Path, whole: Path)
     """Found when all are at work: the first says why, and both end."""
     run = campaign.unfinished(whole, tmp_path / "run", STEPS // 2)
     seal = run / "checkpoints" / str(checkpoint.steps(run)[0]) / NAME
-    seal.write_text(seal.read_text().replace('"format":1', '"format":2'))
+    seal.write_text(seal.read_text().replace(f'"format":{FORMAT}', f'"format":{FORMAT + 1}'))
     first, second = (campaign.end(p, SURVIVOR_SECONDS) for p in pair(*TRAIN, "--out", run, "--resume"))
     assert first.code == 2
     assert "later version of qrl" in first.error

@@ -1,10 +1,18 @@
-"""The worlds: a pendulum and a quadrotor as Brax environments. Importing registers them with Brax."""
+"""The worlds: a pendulum and a quadrotor as Brax environments. Importing registers them with Brax.
+
+Brax takes seconds to import and this asks for none of it: they are registered as soon as somebody imports `brax.envs`.
+"""
 
 import functools
+from types import ModuleType
 
-from brax.envs import register_environment
+from wrapt import when_imported
 
 from qrl_envs import env, task
 
-for _name in task.shipped():
-    register_environment(_name, functools.partial(env.make, _name))  # pyright: ignore[reportArgumentType]
+
+@when_imported("brax.envs")
+def _register(envs: ModuleType) -> None:
+    envs.Env.register(env.TaskEnv)
+    for name in task.shipped():
+        envs.register_environment(name, functools.partial(env.make, name))

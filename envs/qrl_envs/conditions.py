@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from brax.envs.base import State
 
 from qrl_envs import quadrotor, rotation
-from qrl_envs.env import QuadrotorEnv
+from qrl_envs.env import QuadrotorEnv, State
 from qrl_envs.quadrotor import Body, Pose, Twist
 from qrl_envs.task import QuadrotorTask
 

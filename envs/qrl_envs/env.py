@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import chex
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+from flax import struct
 
 from qrl_envs import measures, pendulum, quadrotor, rewards, symmetry
 from qrl_envs import task as tasks
@@ -38,17 +38,31 @@ class Lane(NamedTuple):
     params: Params
 
 
+class State(struct.PyTreeNode):
+    """`brax.envs.State`, field by field. Not that class itself, as Brax takes seconds to import."""
+
+    pipeline_state: Any
+    obs: chex.Array  # [observation_size]
+    reward: chex.Array  # []
+    done: chex.Array  # [] float 0 or 1
+    metrics: dict[str, chex.Array] = struct.field(default_factory=dict)
+    info: dict[str, Any] = struct.field(default_factory=dict)
+
+
 class Evaluation(NamedTuple):
     """How a task is judged: fly `env` for `steps`, add up the first `return_steps` rewards, then `measure`."""
 
-    env: Env
+    env: "TaskEnv"
     steps: int
     return_steps: int
     measure: Callable[[chex.Array], dict[str, chex.Array]] | None  # observations [steps + 1, F] -> named scalars
 
 
-class TaskEnv(Env):
-    """A Brax environment made from a task; subclasses say what one world does."""
+class TaskEnv(abc.ABC):
+    """A Brax environment made from a task; subclasses say what one world does.
+
+    An instance of `brax.envs.Env` wherever Brax has been imported: `import qrl_envs` sees to it.
+    """
 
     def __init__(self, task: Task, params: Params, observation_size: int, action_size: int) -> None:
         self.task = task
@@ -66,6 +80,10 @@ class TaskEnv(Env):
     @property
     def backend(self) -> str:
         return "qrl"
+
+    @property
+    def unwrapped(self) -> "TaskEnv":
+        return self
 
     @property
     def episode_steps(self) -> int:

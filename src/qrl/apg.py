@@ -9,7 +9,8 @@ from collections.abc import Callable
 import chex
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
+
+from qrl.types import Env, State
 
 Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [..., A]
 

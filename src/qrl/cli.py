@@ -1,9 +1,7 @@
 """The command line's first second: parse, say what begins, import the rest (`commands`), map errors to exit codes."""
 
 import argparse
-import contextlib
 import difflib
-import io
 import os
 import sys
 import warnings
@@ -131,14 +129,12 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
 
 
 def _load() -> None:
-    """Import JAX and Brax (seconds on a cold disk), Brax's remarks kept off the screen; use the compile cache."""
+    """Import JAX (seconds on a cold disk); use the compile cache."""
     # NumPy's products are small here; threads of its own would fight XLA's: an export took five times as long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    warnings.filterwarnings("ignore", module=r"brax\..*")
-    with contextlib.redirect_stdout(io.StringIO()):  # Brax prints which optional packages it does not find
-        import jax
+    warnings.filterwarnings("ignore", module=r"brax\..*")  # its remarks are not on what the user did
+    import jax
 
-        import qrl_envs  # noqa: F401  registers our tasks with Brax
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "qrl" / "xla"
         jax.config.update("jax_compilation_cache_dir", str(cache))

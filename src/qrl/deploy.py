@@ -12,7 +12,6 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
 from numpy.typing import NDArray
 
 from qrl import evaluate, request, restore, runs
@@ -27,6 +26,8 @@ from qrl.export.report import Flown, Measured, report
 from qrl.learner import MAX_NORMALISED
 from qrl.policy import Acted, Observed, Origin, Policy
 from qrl.state import point, stack
+from qrl.statistics import deviation
+from qrl.types import Env, State
 from qrl_envs import ports
 from qrl_envs.specfile import BadInput
 
@@ -94,6 +95,7 @@ class Run:
         shipped = jax.tree.map(lambda x: np.asarray(x[0], np.float64), learner.shipped(self.learner))
         layers = shipped.params.policy["params"]
         size = learner.observation_size
+        std = np.asarray(deviation(shipped.statistics))
         observed, acted = self._ports()
         policy = Policy(
             origin=self._origin(),
@@ -101,7 +103,7 @@ class Run:
             observed=observed,
             acted=acted,
             observation_offset=shipped.statistics.mean if config.normalise_observations else np.zeros(size),
-            observation_gain=1.0 / shipped.statistics.std if config.normalise_observations else np.ones(size),
+            observation_gain=1.0 / std if config.normalise_observations else np.ones(size),
             observation_clip=MAX_NORMALISED if config.normalise_observations else np.inf,
             observation_scale=np.asarray(config.observation_scale or np.ones(size)),
             layers=tuple((layers[f"Dense_{i}"]["kernel"], layers[f"Dense_{i}"]["bias"]) for i in range(len(layers))),

@@ -7,7 +7,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
+
+from qrl.types import Env, State
 
 
 class Flights(NamedTuple):

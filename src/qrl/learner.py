@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.training.acme import running_statistics as statistics
 from jax.flatten_util import ravel_pytree
 
 from qrl.config import Config
 from qrl.networks import MLP, log_density
 from qrl.objective import perceptron
+from qrl.statistics import Statistics, deviation, merged, none_yet
 from qrl.types import Networks, Transition
 from qrl.vtrace import vtrace
 
@@ -27,7 +27,7 @@ class LearnerState(NamedTuple):
     params: Networks
     optimiser: Networks  # each network's own Adam
     average: chex.ArrayTree  # policy parameters, averaged
-    statistics: statistics.RunningStatisticsState  # of observations; identity unless normalise_observations
+    statistics: Statistics  # of observations, where they are normalised
     updates: chex.Array  # int32 []
 
 
@@ -86,7 +86,7 @@ class Learner:
             params=params,
             optimiser=Networks(*(self._optimiser.init(ravel_pytree(network)[0]) for network in params)),
             average=params.policy,
-            statistics=statistics.init_state(jnp.zeros(self.observation_size)),
+            statistics=none_yet(self.observation_size),
             updates=jnp.int32(0),
         )
 
@@ -102,7 +102,8 @@ class Learner:
     def scale(self, state: LearnerState, observation: chex.Array) -> chex.Array:
         """Observations as the networks see them; [..., F] -> [..., F]."""
         if self.config.normalise_observations:
-            observation = statistics.normalize(observation, state.statistics, max_abs_value=MAX_NORMALISED)
+            standard = (observation - state.statistics.mean) / deviation(state.statistics)
+            observation = jnp.clip(standard, -MAX_NORMALISED, MAX_NORMALISED)
         return observation * self.hyper["observation_scale"] if "observation_scale" in self.hyper else observation
 
     def mean(self, state: LearnerState, observation: chex.Array) -> chex.Array:
@@ -121,11 +122,8 @@ class Learner:
         """Take observations [..., F] into the running statistics, where they are used."""
         if not self.config.normalise_observations:
             return state
-        return state._replace(
-            statistics=statistics.update(
-                state.statistics, observation.reshape(-1, self.observation_size), pmap_axis_name=self.axis
-            )
-        )
+        batch = observation.reshape(-1, self.observation_size)
+        return state._replace(statistics=merged(state.statistics, batch, self.axis))
 
     def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
         """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""

@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from brax.envs.base import Env
 
 from qrl import checkpoint, peers, restore, runs
 from qrl.checkpoint import Checkpoint
@@ -30,6 +29,7 @@ from qrl.seal import Record
 from qrl.state import point, spread, stack
 from qrl.tensorboard import EventLog
 from qrl.train import Trainer
+from qrl.types import Env
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
 

@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import numpy as np
-from brax.envs.base import Env
 
 from qrl import evaluate, restore
 from qrl.config import Config
@@ -19,6 +18,7 @@ from qrl.evaluate import Flights
 from qrl.learner import LearnerState
 from qrl.state import point, stack
 from qrl.train import Trainer, xla_effort
+from qrl.types import Env
 from qrl_envs.controllers import geometric, lqr
 from qrl_envs.task import QuadrotorTask
 

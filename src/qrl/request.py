@@ -1,17 +1,19 @@
 """From what the user asked (task, flags, CONFIG, run folder) to a run that can start; BadInput if it cannot."""
 
+import contextlib
+import io
 import os
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import jax
-from brax import envs
-from brax.envs.base import Env
 
 from qrl import runs
 from qrl.config import Config
 from qrl.runs import ConfigFile, RunConfig, TaskRecord
 from qrl.state import spread
+from qrl.types import Env
 from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as tasks
@@ -20,16 +22,24 @@ from qrl_envs.specfile import BadInput
 MOST_SEEDS = 10_000  # of one program
 
 
+def _brax_envs() -> ModuleType:
+    """`brax.envs`: over a second to import, and wanted for its own environments alone."""
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints which optional packages it does not find
+        from brax import envs
+
+    return envs
+
+
 def foreign_tasks() -> list[str]:
     """Brax's own environments, which can be trained by name too."""
-    return sorted(set(envs._envs) - set(tasks.shipped()))  # Brax offers no public list
+    return sorted(set(_brax_envs()._envs) - set(tasks.shipped()))  # Brax offers no public list
 
 
 def task_record(name: str) -> TaskRecord:
     """The task of a shipped name, a `.json` path or one of Brax's names."""
-    if name in foreign_tasks():
-        return TaskRecord(name=name, spec=None)
     if name not in tasks.shipped() and not name.endswith(".json"):
+        if name in foreign_tasks():
+            return TaskRecord(name=name, spec=None)
         raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*tasks.shipped(), *foreign_tasks()])}")
     spec = tasks.load(name).model_dump(mode="json", exclude_none=True)
     return TaskRecord(name=_folder(Path(name).stem, name), spec=spec)
@@ -53,7 +63,7 @@ def _folder(name: str, where: str) -> str:
 def environment(record: TaskRecord) -> Env:
     """The Brax environment of a recorded task."""
     if record.spec is None:
-        return envs.get_environment(record.name)
+        return _brax_envs().get_environment(record.name)
     return worlds.from_task(spec(record))
 
 

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env
 
 from qrl import checkpoint, laps
 from qrl.learner import Learner, LearnerState
@@ -14,6 +13,7 @@ from qrl.runs import RunConfig
 from qrl.seal import Damaged, Record
 from qrl.state import Point, TrainState, stack
 from qrl.train import Trainer
+from qrl.types import Env
 
 
 class Restored(NamedTuple):

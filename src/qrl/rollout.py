@@ -10,10 +10,9 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from brax.envs.base import Env, State
 
 from qrl.networks import log_density
-from qrl.types import Transition
+from qrl.types import Env, State, Transition
 
 BLOCK_LANES = 512  # at most, stepped at a time on a CPU: with more, what passes between the steps leaves its cache
 

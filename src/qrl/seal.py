@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from qrl.runs import Row, replace_text
 
 NAME = "seal.json"
-FORMAT: Literal[1] = 1
+FORMAT: Literal[2] = 2
 
 
 class Record(BaseModel):
@@ -27,7 +27,7 @@ class Record(BaseModel):
 class Seal(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
 
-    format: Literal[1] = FORMAT
+    format: Literal[2] = FORMAT
     run_sha256: str  # whose it is
     record: Record
     record_sha256: str
@@ -62,8 +62,9 @@ def checked(path: Path) -> Seal:
         version = json.loads(text)
     except (OSError, ValueError, RecursionError) as error:
         raise Damaged(f"{path}/{NAME}: cannot be read ({first_line(error)})") from None
-    if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found > FORMAT:
-        raise Foreign(f"{path}: of a later version of qrl (format {str(found)[:20]}; this one reads {FORMAT})")
+    if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found != FORMAT:
+        when = "a later" if found > FORMAT else "an earlier"
+        raise Foreign(f"{path}: of {when} version of qrl (format {str(found)[:20]}; this one reads {FORMAT})")
     try:
         seal = Seal.model_validate_json(text)
     except ValidationError as error:

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import numpy as np
-from brax.envs.base import Env
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
@@ -18,6 +17,7 @@ from qrl.buffer import Ring
 from qrl.config import Config
 from qrl.learner import Hyper, LearnerState, Terms, hyper
 from qrl.rollout import Lanes
+from qrl.types import Env
 
 MEMBER, SHARD = "member", "shard"  # the mesh's axes
 FAULT_TERMS = ("reward", "observation", *Terms._fields)

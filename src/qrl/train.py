@@ -15,7 +15,6 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
@@ -25,7 +24,7 @@ from qrl.config import Config
 from qrl.learner import Learner, LearnerState, Terms
 from qrl.rollout import Lanes
 from qrl.state import FAULT_TERMS, LAYOUT, MEMBER, SHARD, Point, Totals, TrainState
-from qrl.types import Transition
+from qrl.types import Env, Transition
 
 
 class Trainer:

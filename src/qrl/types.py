@@ -1,8 +1,37 @@
-"""Values that flow between rollout, ring buffer and learner."""
+"""Values that flow between rollout, ring buffer and learner, and what the learner takes for an environment."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import chex
+
+
+class State(Protocol):
+    """`brax.envs.State`, or what has its fields; any pytree will do as the physics' state."""
+
+    @property
+    def pipeline_state(self) -> Any: ...
+    @property
+    def obs(self) -> chex.Array: ...
+    @property
+    def reward(self) -> chex.Array: ...
+    @property
+    def done(self) -> chex.Array: ...
+    @property
+    def metrics(self) -> dict[str, chex.Array]: ...
+    @property
+    def info(self) -> dict[str, Any]: ...
+    def replace(self, **changes: Any) -> Any: ...
+
+
+class Env(Protocol):
+    """`brax.envs.Env`, or what has its methods, with flat observations. (Brax itself takes seconds to import.)"""
+
+    def reset(self, rng: chex.PRNGKey) -> State: ...
+    def step(self, state: Any, action: chex.Array) -> State: ...
+    @property
+    def observation_size(self) -> int: ...
+    @property
+    def action_size(self) -> int: ...
 
 
 class Transition(NamedTuple):
