@@ -75,7 +75,7 @@ def sweep(path: Path, out: Path, *, fresh: bool) -> None:
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
         (out / CODE).write_text(stamp(path))
-    figure_runs.qrl(["sweep", str(path), "--out", str(out)], parted=True)
+    figure_runs.qrl(["sweep", str(path), "--out", str(out)])
 
 
 def stamp(path: Path) -> str:

@@ -11,7 +11,7 @@ import numpy as np
 
 from figure_flights import Flown
 from figure_plots import PUBLISHED, Curves, Rate, thousands
-from figure_runs import PAPER_RATES, PARTED, Wanted
+from figure_runs import PAPER_RATES, Wanted
 from qrl import request
 from qrl.runs import RunConfig
 from qrl_envs.conditions import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
@@ -80,8 +80,8 @@ def page(caption: Caption, made: Made) -> str:
 
 def _command(one: Wanted, config: RunConfig) -> str:
     """As it was run: results agree only to rounding on another number of devices."""
-    parted = len(config.devices) > 1 and all("cpu" in device.lower() for device in config.devices)
-    before = "".join(f"{name}={value} " for name, value in PARTED.items()) if parted else ""
+    cpu = any("cpu" in device.lower() for device in config.devices)
+    before = f"JAX_NUM_CPU_DEVICES={len(config.devices)} " if cpu else ""
     return f"{before}qrl {' '.join(one.words)}"
 
 

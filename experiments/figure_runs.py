@@ -21,8 +21,6 @@ TRAINING = ("qrl.laps", "qrl_envs.env")  # what they import, and they, decide a 
 CODE = "code.sha256"  # in a run's folder: of which code it is
 
 SEEDS, FAST_SEEDS = 6, 2  # even, so that two cores share them
-# A device each, and no threads of XLA's besides: docs/profile.md.
-PARTED = {"JAX_NUM_CPU_DEVICES": "2", "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"}
 PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
 PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
 METHOD = {"apg_fraction": 0.0}  # the paper's method to the end, on trajectories that symmetries turn
@@ -166,15 +164,15 @@ def make(one: Wanted, folder: Path) -> float:
         folder.mkdir(parents=True)
         (folder / CODE).write_text(sha256())
     begun = time.perf_counter()
-    qrl(words, parted=one.seeds > 1)
+    qrl(words)
     return time.perf_counter() - begun
 
 
-def qrl(words: list[str], *, parted: bool = False) -> None:
-    """The command line in a process of its own, `parted` as `environment` says; Failed if it fails."""
+def qrl(words: list[str]) -> None:
+    """The command line in a process of its own; Failed if it fails."""
     command = [sys.executable, "-m", "qrl", *words]
     # In a session of its own, so that Ctrl-C reaches it once: through us.
-    with subprocess.Popen(command, env=environment(parted=parted), start_new_session=True) as process:
+    with subprocess.Popen(command, env=environment(), start_new_session=True) as process:
         try:
             code = process.wait()
         except BaseException:
@@ -185,12 +183,10 @@ def qrl(words: list[str], *, parted: bool = False) -> None:
         raise Failed(f"qrl {' '.join(words)} ended with exit code {code}")
 
 
-def environment(*, parted: bool) -> dict[str, str]:
-    """Of a run's process: this code's own packages and, where its seeds or members may part between two of a CPU's
-    cores, PARTED; what the caller's own environment says goes before."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def environment() -> dict[str, str]:
+    """Of a run's process: this code's own packages, whatever is installed."""
     paths = os.pathsep.join([str(ROOT / "src"), str(ROOT / "envs"), *filter(None, [os.environ.get("PYTHONPATH")])])
-    return {**(PARTED if parted and cores > 1 else {}), **os.environ, "PYTHONPATH": paths}
+    return {**os.environ, "PYTHONPATH": paths}
 
 
 # What a run says

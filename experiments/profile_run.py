@@ -7,6 +7,7 @@ time which its multiply-adds alone would take, at the rate of a 64 x 64 product 
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from profile_parts import REPEATED, Now, Part, Turn, now_of, parts
-from qrl import laps, processes, request, runs
+from qrl import laps, request, runs
 from qrl.state import Point, TrainState, point, stack
 from qrl.train import Trainer, xla_effort
 
@@ -27,7 +28,7 @@ WHOLE = 4  # unrolls of the whole, within a timed call
 def begun(task: str) -> tuple[Trainer, Point, TrainState, Callable[..., TrainState]]:
     """A run of one member whose ring is full: trainer, points, states, and what advances them."""
     run = request.run_config(task, None, runs.ConfigFile(), {}, 0, 1)
-    processes.limit_threads(run.learner)
+    os.environ.setdefault("PJRT_NPROC", "1")  # each device has about a core
     env, config = request.environment(run.task), run.learner
     trainer, points = Trainer(env, config), stack([point(env, config)])
     states = trainer.init(laps.seeds(0, 1), points)

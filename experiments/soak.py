@@ -33,7 +33,7 @@ def main() -> int:
     reports = max(4, round(args.steps / REPORT_STEPS))
     long = {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}
     run = request.run_config("hover", None, runs.ConfigFile(), long, 0, 1)
-    processes.limit_threads(run.learner)
+    processes.use_cores(run, [])
     if args.out.exists():
         print(f"{args.out}: exists already; give another --out", file=sys.stderr)
         return 2

@@ -2,17 +2,19 @@
 
 acting     policy 64-64, noise, physics, reward, fresh starts and recording: `rollout.unroll` of hover
 physics    the quadrotor's step alone, thrusts about those of a hover, in blocks of lanes as `rollout.unroll` has them
-learning   samples through draw, gather, symmetries, both networks, V-trace, loss, clip and Adam: `Learner.update` on
-           the ring of a run on its way
+learning   samples through draw, gather, symmetries, both networks, V-trace, loss, clip and Adam, in a loop that acts
+           for 1 of 512 updates
 training   environment steps of the whole loop, each sample learnt from as often as by Brax PPO's defaults (16
            minibatches an unroll, two passes): with unrolls of 50 steps, and of Brax's 10, which makes as many
            optimiser steps a step of the environment
+
+Each over the devices that `qrl train` would make of this machine's cores, or those that JAX_NUM_CPU_DEVICES says.
 """
 
 import argparse
 import sys
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +23,11 @@ sys.path.insert(0, str(Path(__file__).parent / "peers"))
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import NamedSharding
+from jax.sharding import PartitionSpec as P
 
-from qrl import buffer, laps, request, rollout, runs
-from qrl.learner import Learner
-from qrl.state import point, spread, stack
+from qrl import buffer, laps, processes, request, rollout, runs
+from qrl.state import LAYOUT, MEMBER, SHARD, point, spread, stack
 from qrl.train import Trainer, xla_effort
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
@@ -41,97 +44,67 @@ def hover(**learner: Any) -> runs.RunConfig:
 
 
 def acting(lanes: int, key: jax.Array) -> None:
-    run = hover(lanes=lanes)
-    env = request.environment(run.task)
-    learner = Learner(run.learner, 18, 4)
-    state = learner.init(key)
-    longest = rollout.episode_steps(env, run.learner.episode_steps)
+    trainer, states, points = begun(hover(lanes=lanes, ring_unrolls=1))
+    unrolls = max(1, LANES[-1] // lanes)  # as many steps in each call, which takes time of its own
 
-    @partial(jax.jit, compiler_options=xla_effort(1))
-    def unroll(state: Any, starts: Any, carry: Any) -> Any:
-        now, key, _ = carry
-        key, mine = jax.random.split(key)
-        now, seen = rollout.unroll(
-            env,
-            now,
-            lambda observation: learner.mean(state, observation),
-            learner.sigma(state),
-            mine,
-            starts,
-            unroll_steps=UNROLL_STEPS,
-            longest=longest,
-        )
-        return now, key, seen
+    def act(members: Any, carry: Any, key: Any) -> Any:
+        (learner, starts, here), mine = jax.tree.map(lambda x: x[0], (members, carry))
+        under, _ = trainer._under(here)
 
-    starts = jax.random.PRNGKey(1)
-    first = rollout.begin(env, starts, jnp.arange(lanes, dtype=jnp.int32), lanes, longest, UNROLL_STEPS)
-    act = partial(unroll, state, starts)
-    rate(f"acting, {lanes:,} lanes", lanes * UNROLL_STEPS, act, (first, key, None), jax.block_until_ready)
+        def unroll(i: Any, mine: Any) -> Any:
+            now, ring = mine
+            now, seen = trainer._collect(under, learner, now, jax.random.fold_in(key, i), starts)
+            return now, buffer.add(ring, seen)
+
+        return jax.tree.map(lambda x: x[None], jax.lax.fori_loop(0, unrolls, unroll, mine))
+
+    places = LAYOUT.lanes, LAYOUT.ring
+    program = trainer._over_mesh(act, (P(MEMBER), places, P()), places)
+    acted = jax.jit(program, donate_argnums=1, compiler_options=xla_effort(1))
+    members = states.learner, states.starts, points
+
+    def on(carry: Any) -> Any:
+        mine, key = carry
+        key, now = jax.random.split(key)
+        return acted(members, mine, now), key
+
+    first = (states.lanes, states.ring), key
+    rate(f"acting, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, on, first, jax.block_until_ready)
 
 
 def physics(lanes: int, key: jax.Array) -> None:
     env = worlds.make("hover")
     params: Any = env.params
     dt_s = env.task.control_period_s
+    mesh = spread(jax.devices(), 1, hover(lanes=lanes).learner.logical_shards)
+    blocks = max(mesh.size if mesh else 1, lanes // rollout.BLOCK_LANES)
+    unrolls = max(1, LANES[-1] // lanes)
 
-    blocks = max(1, lanes // rollout.BLOCK_LANES)
-
-    @partial(jax.jit, compiler_options=xla_effort(1))
     def steps(params: Any, thrusts: Any, bodies: Any) -> Any:
         each = jax.vmap(lambda body, thrust: quadrotor.step(params, body, thrust, dt_s))
 
         def block(of: Any) -> Any:
             return jax.lax.scan(lambda b, thrust: (each(b, thrust), None), *of)[0]
 
-        return jax.lax.map(block, (bodies, thrusts))
+        return jax.lax.fori_loop(0, unrolls, lambda _, now: jax.lax.map(block, (now, thrusts)), bodies)
 
+    if mesh:
+        steps = jax.shard_map(steps, mesh=mesh, in_specs=(P(), P(SHARD), P(SHARD)), out_specs=P(SHARD), check_vma=False)
     draw = jax.vmap(jax.vmap(lambda k: quadrotor.draw(params.start, k)))
     bodies = draw(jax.random.split(key, (blocks, lanes // blocks)))
     about = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
     thrusts = quadrotor.hover_thrust_N(params.physics) * about
-    step = partial(steps, jax.tree.map(jnp.asarray, params.physics), thrusts)
-    rate(f"physics, {lanes:,} lanes", lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
-
-
-@cache
-def on_its_way() -> Any:
-    """A hover run's learner, full ring and point, when it has just been filled."""
-    run = hover()
-    trainer, states, points = begun(run)
-    advance = laps.compile_advance(trainer, states, points)
-    states = advance(states, points, np.int32(run.learner.ring_unrolls))
-    return jax.tree.map(lambda x: jnp.array(x[0]), (states.learner, states.ring, points))
+    if mesh:
+        bodies, thrusts = jax.device_put((bodies, thrusts), NamedSharding(mesh, P(SHARD)))
+    step = partial(jax.jit(steps, compiler_options=xla_effort(1)), jax.tree.map(jnp.asarray, params.physics), thrusts)
+    rate(f"physics, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
 
 
 def learning(minibatch_lanes: int, key: jax.Array) -> None:
-    run = hover(minibatch_lanes=minibatch_lanes)
-    trainer = Trainer(request.environment(run.task), run.learner)
-    updates, shards = 64, run.learner.logical_shards
-    state, ring, here = on_its_way()
-
-    @partial(jax.jit, compiler_options=xla_effort(1))
-    def learn(ring: Any, here: Any, carry: Any) -> Any:
-        state, key = carry
-        key, mine = jax.random.split(key)
-        keys = jax.random.split(mine, shards)
-        learner, env = trainer._under(here)
-        index = buffer.draw(ring, keys, updates, minibatch_lanes // shards)
-
-        def update(now: Any, drawn: Any) -> Any:
-            index, turns = drawn
-            return learner.update(now, trainer._turned(env, buffer.gather(ring, index), turns))
-
-        state, terms = jax.lax.scan(update, state, (index, trainer._turns(keys, index)))
-        return (state, key), terms
-
+    updates = 512
+    run = hover(minibatch_lanes=minibatch_lanes, updates_per_unroll=updates, warmup_unrolls=1, steps=10**9)
     samples = updates * minibatch_lanes * UNROLL_STEPS
-    rate(
-        f"learning, {minibatch_lanes * UNROLL_STEPS:,} samples a minibatch",
-        samples,
-        lambda carry: jax.block_until_ready(learn(ring, here, carry))[0],
-        (state, key),
-        jax.block_until_ready,
-    )
+    advancing(f"learning, {minibatch_lanes * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
 
 
 def training(unroll_steps: int, key: jax.Array) -> None:
@@ -144,15 +117,20 @@ def training(unroll_steps: int, key: jax.Array) -> None:
         updates_per_unroll=BRAX_MINIBATCHES * BRAX_PASSES,
         minibatch_lanes=TRAINING_LANES // BRAX_MINIBATCHES,
     )
+    unrolls = 200 // unroll_steps
+    advancing(TRAINING[unroll_steps], run, unrolls, unrolls * run.learner.unroll_size)
+
+
+def advancing(figure: str, run: runs.RunConfig, unrolls: int, counted: int) -> None:
+    """How much of what is `counted` in so many unrolls the training loop does."""
     trainer, states, points = begun(run)
     advance = laps.compile_advance(trainer, states, points)
-    unrolls = 200 // unroll_steps
 
     def on(carry: Any) -> Any:
         states, done = carry
         return advance(states, points, np.int32(done + unrolls)), done + unrolls
 
-    rate(TRAINING[unroll_steps], unrolls * run.learner.unroll_size, on, (states, 0), jax.block_until_ready)
+    rate(figure, counted, on, (states, 0), jax.block_until_ready)
 
 
 def begun(run: runs.RunConfig) -> tuple[Trainer, Any, Any]:
@@ -175,6 +153,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=ROWS, default=list(ROWS))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
+    processes.use_cores(hover(), [])
     for name in args.only:
         measure, sizes = ROWS[name]
         for size in sizes:

@@ -30,6 +30,7 @@ def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    jax.devices()  # one, whatever the first command here would say
 
 
 @pytest.fixture(autouse=True)

@@ -63,6 +63,17 @@ def test_evaluate_flies_the_last_checkpoints(trained: Path, tmp_path: Path, caps
 
 
 @pytest.mark.usefixtures("quick_compilation")
+def test_brax_is_imported_for_its_own_tasks_alone() -> None:
+    """It takes longer than all else that a command begins with."""
+    program = (
+        "import sys; from qrl import deploy, request, sweep_command, train_command, view_command;"
+        "print([(name, request.environment(request.task_record(name)).action_size, 'brax' in sys.modules)"
+        " for name in ('hover', 'pendulum', 'fast')])"
+    )
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert said == "[('hover', 4, False), ('pendulum', 1, False), ('fast', 1, True)]\n"
+
+
 def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every seed, with a table for each; what is nominal is said as without the flag."""
     task, run = tmp_path / "short.json", tmp_path / "run"

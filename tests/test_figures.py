@@ -1,7 +1,6 @@
 """The paper's figures and the ablation's table: when a run is current, what is drawn, and what is told of it."""
 
 import json
-import os
 import re
 import sys
 from pathlib import Path
@@ -320,20 +319,7 @@ def test_a_caption_says_how_it_was_made_and_its_numbers_are_the_runs(tmp_path: P
     devices = [f"TFRT_CPU_{i}" for i in range(2)]
     runs.write_json(folder / "config.json", HOVER.config().model_dump(mode="json") | {"devices": devices})
     page = captions.page(caption, Made("make figures", "abc123", "", [(HOVER, folder)]))
-    assert "`JAX_NUM_CPU_DEVICES=2 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false qrl train hover --seeds 2" in page
-
-
-def test_cores_are_parted_where_there_are_seeds_to_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A device each; the caller's own environment goes before."""
-    for name in figure_runs.PARTED:
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1}, raising=False)
-    assert figure_runs.PARTED.items() <= figure_runs.environment(parted=True).items()
-    assert not figure_runs.PARTED.keys() & figure_runs.environment(parted=False).keys()
-    monkeypatch.setenv("XLA_FLAGS", "--mine")
-    assert figure_runs.environment(parted=True)["XLA_FLAGS"] == "--mine"
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0}, raising=False)
-    assert "JAX_NUM_CPU_DEVICES" not in figure_runs.environment(parted=True)
+    assert "`JAX_NUM_CPU_DEVICES=2 qrl train hover --seeds 2" in page
 
 
 def test_hover_is_held_against_ten_million_steps() -> None:

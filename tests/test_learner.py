@@ -148,6 +148,35 @@ def test_update_ascends_both_losses() -> None:
     assert last.value_loss < first.value_loss
 
 
+def test_normalised_the_policy_gradient_is_divided_by_the_deviation_of_a() -> None:
+    """The objective with xi = epsilon·|A| is proportional to A; the critic's is not concerned."""
+    data = batch()
+    data = data._replace(reward=5.0 * data.reward)
+    plain, normal = (
+        jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)[1]
+        for learner in (Learner(config(normalise_advantage=on), F, A) for on in (False, True))
+    )
+    assert plain.a_trace > 2.0
+    np.testing.assert_allclose(normal.policy_gradient, plain.policy_gradient / plain.a_trace, rtol=1e-5)
+    np.testing.assert_allclose(normal.value_gradient, plain.value_gradient, rtol=1e-5)
+
+
+@pytest.mark.parametrize("xi", [None, 0.3])
+def test_a_minibatch_in_parts_is_the_whole(xi: float | None) -> None:
+    """A trajectory on each of three devices: A is normalised by its deviation over all."""
+    data = batch()
+    data = data._replace(reward=data.reward * jnp.array([0.2, 1.0, 5.0])[:, None])  # parts differ
+    learner = Learner(config(xi=xi), F, A)
+    whole = jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)
+    shared = Learner(config(xi=xi), F, A, "device")
+    parts = jax.tree.map(lambda x: x[:, None], data)
+    each = jax.jit(jax.vmap(shared.update, in_axes=(None, 0), axis_name="device"))(
+        learner.init(jax.random.PRNGKey(1)), parts
+    )
+    for device in range(B):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x[device], y, rtol=2e-4, atol=2e-6), each, whole)  # noqa: B023
+
+
 def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
     """Targets and advantages are constants: scaling rewards by −1 leaves the critic's own pull, not a mixed one."""
     learner = Learner(config(normalise_advantage=False), F, A)

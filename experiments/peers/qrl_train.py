@@ -16,7 +16,7 @@ import qrl_envs  # noqa: F401 - registers our environments with Brax
 from judge import Act, Judge, pendulum_judge, success_judge
 from qrl import laps, processes, request, runs
 from qrl.evaluate import summarise
-from qrl.state import point, stack
+from qrl.state import point, spread, stack
 from qrl.train import Trainer
 
 STARTS, EVALUATION_STARTS_SEED = 1000, 1_000_003  # those of `qrl evaluate`
@@ -27,9 +27,10 @@ def contestant(task: str, preset: str | None, seed: int, flags: dict[str, Any]) 
     fast = f"{task}_fast"
     name = preset or (fast if fast in runs.presets() else task)
     run = request.run_config(task, None, runs.ConfigFile(learner=runs.preset(name)), flags, seed, 1)
-    processes.limit_threads(run.learner)
+    processes.use_cores(run, [])
     env = request.environment(run.task)
-    return Trainer(env, run.learner), stack([point(env, run.learner)]), run
+    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.logical_shards))
+    return trainer, stack([point(env, run.learner)]), run
 
 
 def pendulum_judged(trainer: Trainer) -> Callable[[Any], Act]:
@@ -65,7 +66,9 @@ def main() -> None:
         on = advance if until <= config.learning_unrolls else climb
         states = jax.block_until_ready(on(states, points, np.int32(until)))
         learners = states.learner
-        policy = judged(jax.tree.map(lambda x: x[0], learners)) if args.task == "pendulum" else learners
+        policy = (
+            judged(jax.tree.map(lambda x: x[0], trainer.on_host(learners))) if args.task == "pendulum" else learners
+        )
         if judge.check(until * config.unroll_size, policy):
             break
 

@@ -128,6 +128,11 @@ class Learner:
     def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
         """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""
         gradient, terms = self._over_devices(jax.grad(self._loss, has_aux=True)(state.params, state, batch))
+        if self.config.normalise_advantage and not self._scaled_before:
+            divisor = _divisor(terms.a_trace)
+            gradient = gradient._replace(policy=jax.tree.map(lambda x: x / divisor, gradient.policy))
+            terms = terms._replace(policy_loss=terms.policy_loss / divisor)
+        terms = terms._replace(a_trace=jnp.sqrt(terms.a_trace))
         start, end = self.hyper["learning_rate"], self.hyper["learning_rate_end"]
         rate = start + self.progress(state) * (end - start)
 
@@ -232,9 +237,10 @@ class Learner:
             rho,
         )
         a_trace = trace.a_trace
-        deviation = jnp.sqrt(self._over_devices(jnp.mean(a_trace**2)))
-        if config.normalise_advantage:
-            a_trace = a_trace / (deviation + 1e-8)
+        square = jnp.mean(a_trace**2)
+        if self._scaled_before:
+            square = self._over_devices(square)
+            a_trace = a_trace / _divisor(square)
         margins = {"epsilon": hyper["epsilon"], "xi": hyper.get("xi")}
         policy_loss = -jnp.mean(perceptron(log_pi, batch.log_mu, a_trace, form=config.form, **margins))
         value_loss = jnp.mean((value - trace.v_trace) ** 2)
@@ -242,12 +248,20 @@ class Learner:
         return policy_loss + value_loss, Terms(
             log_rho=jnp.mean(log_rho),
             value=jnp.mean(value),
-            a_trace=deviation,
+            a_trace=square,
             policy_loss=policy_loss,
             value_loss=value_loss,
             policy_gradient=zero,
             value_gradient=zero,
         )
+
+    @property
+    def _scaled_before(self) -> bool:
+        """Whether A is divided by its root mean square before the objective, which takes an exchange of its own.
+
+        With xi = epsilon·|A| the objective is proportional to A, and its gradient may as well be divided afterwards.
+        """
+        return self.config.normalise_advantage and "xi" in self.hyper
 
     def _over_devices(self, part: chex.ArrayTree) -> Any:
         """Means over the devices, in one exchange."""
@@ -286,6 +300,11 @@ def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, 
         return jnp.where(first, anew[:, :1], following)
 
     return jax.lax.cond(jnp.any(within & ~first), lambda: critic(batch.next_observation), shifted)
+
+
+def _divisor(square: chex.Array) -> chex.Array:
+    """What normalises A, from its mean square."""
+    return jnp.sqrt(square) + 1e-8
 
 
 def _apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:

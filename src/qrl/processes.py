@@ -1,20 +1,24 @@
 """What a command runs on: devices, every core of a CPU, the other processes of the command, and those of others."""
 
 import fcntl
+import math
 import os
-from collections.abc import Iterator, Mapping, MutableMapping
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 
 from qrl.config import Config
+from qrl.runs import RunConfig
 from qrl_envs.specfile import BadInput
 
-# docs/profile.md: one thread is 1.2 to 1.4 times as fast at 400 and 800 samples and 64 units, 0.8 to 1.0 at 1,600.
-LITTLE_WORK = 1000 * 64**2  # multiply-adds of an update's largest product
-FEW_LANES = 512
+# Multiply-adds of an update's largest product. Measured with two cores (docs/profile.md): a device more is worth its
+# exchanges where each has 400 samples of 64 units or more; one thread is as fast as XLA's own up to twice that.
+DEVICE_WORK, THREAD_WORK = 400 * 64**2, 1000 * 64**2
+DEVICE_LANES = 512  # stepped by each: worth a device too
+SAID = ("JAX_NUM_CPU_DEVICES", "PJRT_NPROC", "NPROC")  # by the user
 
 
 class Process(NamedTuple):
@@ -53,15 +57,37 @@ def _number(flag: str, value: int | str | None) -> int | None:
         raise BadInput(f"{flag}: expected a number, found '{value}'") from None
 
 
-def limit_threads(learner: Config, environment: MutableMapping[str, str] = os.environ) -> None:
-    """Have XLA use one thread of a CPU where a run's products and unrolls are small, unless its threads are set.
+def use_cores(run: RunConfig, before: Sequence[str], environment: MutableMapping[str, str] = os.environ) -> None:
+    """Say to JAX how a run uses a CPU's cores, unless the user has: as devices, or with one thread.
 
-    What so little work gains by a second core, threads lose by waiting for each other. JAX reads it when it is first
-    asked for its devices: to be called before.
+    A run that is repeated or goes on has as many devices as `before` names, so that its bits are the same. JAX takes no
+    more advice once it was asked for its devices: to be called before.
     """
-    work = learner.minibatch_lanes * learner.unroll_steps * max(*learner.policy_hidden, *learner.critic_hidden) ** 2
-    if work <= LITTLE_WORK and learner.lanes <= FEW_LANES and "NPROC" not in environment:
-        environment.setdefault("PJRT_NPROC", "1")
+    if any(name in environment for name in SAID) or "device_count" in environment.get("XLA_FLAGS", ""):
+        return
+    count = cpu_devices(run.learner, run.seeds, _cores())
+    if before and all("cpu" in name.lower() for name in before):
+        count = min(len(before), _cores())
+    if count > 1:
+        with suppress(RuntimeError):  # it was asked already, by a command before in this process
+            jax.config.update("jax_num_cpu_devices", count)
+    elif _work(run.learner) <= THREAD_WORK and run.learner.lanes <= DEVICE_LANES:
+        environment["PJRT_NPROC"] = "1"  # what so little work gains by a second core, threads lose in waiting
+
+
+def cpu_devices(learner: Config, seeds: int, cores: int) -> int:
+    """As how many devices a run uses so many cores: each has a member of its own, or enough of one's work."""
+    for count in range(cores, 1, -1):
+        parts = count // math.gcd(seeds, count)  # of a member
+        much = _work(learner) >= parts * DEVICE_WORK or learner.lanes >= parts * DEVICE_LANES
+        if parts == 1 or (much and learner.logical_shards % parts == 0):
+            return count
+    return 1
+
+
+def _work(learner: Config) -> int:
+    """Multiply-adds of an update's largest product."""
+    return learner.minibatch_lanes * learner.unroll_steps * max(*learner.policy_hidden, *learner.critic_hidden) ** 2
 
 
 def join(process: Process) -> None:

@@ -266,13 +266,23 @@ class Trainer:
 
         warm = state.unrolls + 1 >= self.config.warmup_unrolls
         learned, terms = jax.lax.cond(warm, learn, wait, observed)
-        fault_update, fault_term = self._fault(transitions, terms, observed.updates)
+        sums = self._sum(
+            jnp.stack(
+                [
+                    jnp.sum(transitions.reward),
+                    jnp.sum(transitions.terminated + transitions.truncated),
+                    jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32),
+                    *(jnp.sum(~jnp.isfinite(x)) for x in (transitions.reward, transitions.next_observation)),
+                ]
+            )
+        )
+        fault_update, fault_term = self._fault(sums[3:] == 0, terms, observed.updates)
         fresh = (state.fault_update < 0) & (fault_update >= 0)
         seen = Totals(
-            rewards=self._sum(jnp.sum(transitions.reward)),
+            rewards=sums[0],
             steps=jnp.float32(self.config.unroll_size),
-            episodes=self._sum(jnp.sum(transitions.terminated + transitions.truncated)),
-            early=self._sum(jnp.sum(lanes.early - state.lanes.early).astype(jnp.float32)),
+            episodes=sums[1],
+            early=sums[2],
             updates=(learned.updates - observed.updates).astype(jnp.float32),
             terms=Terms(*jnp.sum(terms, axis=0)),
         )
@@ -288,10 +298,10 @@ class Trainer:
             totals=jax.tree.map(jnp.add, state.totals, seen),
         )
 
-    def _fault(self, seen: Transition, terms: chex.Array, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
-        """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are. `terms`: each
-        update's."""
-        collected = self._sum(jnp.stack([jnp.sum(~jnp.isfinite(x)) for x in (seen.reward, seen.next_observation)])) == 0
+    def _fault(self, collected: chex.Array, terms: chex.Array, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
+        """(update, index into FAULT_TERMS) of the first number that is not finite; (−1, −1) if all are.
+
+        `collected` [2]: whether rewards and observations of the unroll all are; `terms`: each update's."""
         finite = jnp.concatenate(
             [jnp.tile(collected, (self.config.updates_per_unroll, 1)), jnp.isfinite(terms)], axis=1
         )

@@ -72,8 +72,8 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
         if loop.finished(out, config):
             console.print(f"{out}: finished already; nothing to do")
             return None
-    if not jax.distributed.is_initialized():  # others, who do not know the run yet, would have other threads
-        processes.limit_threads(config.learner)
+    if not jax.distributed.is_initialized():  # others, who do not know the run yet, have a device each
+        processes.use_cores(config, config.devices if held else file.devices)
     if not held:
         config = config.model_copy(update={"devices": request.device_names()})
     elif changed := request.changed_since(config):
