@@ -140,7 +140,7 @@ def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, 
         "PYTHONNOUSERSITE": "1",
         "PYTHONPATH": f"{ROOT / 'src'}{os.pathsep}{ROOT / 'envs'}",
     }
-    if contestant.devices > 1:
+    if contestant.devices:
         env["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={contestant.devices}"
     if contestant.group == "speed":
         env["JAX_COMPILATION_CACHE_DIR"] = str(cache.absolute())

@@ -17,7 +17,7 @@ class Contestant(NamedTuple):
     script: str
     words: tuple[str, ...] = ()
     environment: str | None = None  # requirements of that name; None: qrl's own
-    devices: int = 1  # of the CPU, as JAX is told
+    devices: int | None = None  # of the CPU, as JAX is told; None: as the contestant itself says
 
 
 QRL = "qrl"  # how a group's own contestant, which ratios are to, begins
@@ -39,7 +39,7 @@ CONTESTANTS = (
     Contestant("qrl train hover", "commands", "qrl_command.py", ("hover",)),
     Contestant("qrl train circle", "commands", "qrl_command.py", ("circle",)),
     Contestant("qrl", "speed", "../throughput.py"),
-    Contestant("qrl, two devices", "speed", "../throughput.py", ("--only", "training"), devices=2),
+    Contestant("qrl, one device", "speed", "../throughput.py", ("--only", "training"), devices=1),
     Contestant("Brax", "speed", "brax_speed.py", (), "brax"),
     Contestant("Brax, two devices", "speed", "brax_speed.py", ("--only", "training"), "brax", devices=2),
     Contestant("crazyflow", "speed", "crazyflow_physics.py", ("first_principles",), "crazyflow"),

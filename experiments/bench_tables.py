@@ -14,14 +14,15 @@ from bench_contestants import GROUPS, QRL
 Run = dict[str, Any]
 CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
 BARS = {"pendulum": ("return_mean", -150.0), "hover": ("success", 0.99), "circle": ("success", 0.99)}
-TWO_DEVICES = ", two devices"  # how such a contestant's name, and so its figures, end
+ONE_DEVICE, TWO_DEVICES = ", one device", ", two devices"  # how such a contestant's name, and so its figures, end
 EASIER_PENDULUM = -160.0  # at which the field's figures were taken
 TUNED = (
     "**Whose settings.** qrl races with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
     " `circle_fast`); its commands use the presets that ship as these tasks' defaults. On hover and circle these end"
     " with the gradient of flights through the simulator (APG), which no peer here is given; a step so flown counts as"
-    " a step; *qrl without APG* is the same presets without it. qrl has XLA use one thread where its minibatches are"
-    " small; every other contestant has the threads that it chooses. Brax PPO's were tuned by hand for the pendulum, as"
+    " a step; *qrl without APG* is the same presets without it. qrl makes a device of each core, or has XLA use one thread"
+    " where its minibatches are small, as `qrl train` does; every other contestant has the devices and threads that it"
+    " chooses. Brax PPO's were tuned by hand for the pendulum, as"
     " Brax ships none that suit; on hover and circle it has the same with more lanes and a longer horizon, and no"
     " search was made there. rejax: its own for this task. sbx: the RL Zoo's for this task. rltools: the package's"
     " defaults, made for this task."
@@ -130,8 +131,8 @@ def _of(lines: list[dict[str, float]], name: str) -> str:
 
 
 def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
-    """Of the group `speed`: figure -> contestant -> value by seed. How a contestant ran ("qrl, two devices") is the
-    figure's part, so that like is held against like.
+    """Of the group `speed`: figure -> contestant -> value by seed. How a contestant was told to run ("qrl, one device")
+    is the figure's part.
     """
     found: dict[str, dict[str, dict[int, float]]] = {}
     for run in runs:
@@ -144,23 +145,33 @@ def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
 
 
 def speed(runs: list[Run]) -> str:
-    """A row for each figure; what others reach is told with our rate over theirs."""
-    rows = []
-    for figure, values in figures(runs).items():
+    """A row for each figure; what others reach is told with our rate over theirs, as we run by ourselves."""
+    found, rows = figures(runs), []
+    for figure, values in found.items():
+        ours = found.get(_untold(figure), {}).get(QRL, {})
         for who, theirs in values.items():
-            ratio = None if who == QRL else ratios(values.get(QRL, {}), theirs)
+            ratio = None if who == QRL else ratios(ours, theirs)
             rows.append([figure, who, cell(spread(theirs.values())), cell(ratio, "×") if ratio else ""])
     return _table(["", "", "a second, or seconds", "qrl / this"], rows)
+
+
+def _untold(figure: str) -> str:
+    """Of whoever was not told how to run."""
+    return figure.removesuffix(ONE_DEVICE).removesuffix(TWO_DEVICES)
 
 
 def derived(runs: list[Run]) -> str:
     """What a contestant's rates say of each other: two devices over one, and how acting's cost depends on lanes."""
     found, rows = figures(runs), []
     for figure, values in found.items():
-        for who, two in values.items():
+        for who, told in values.items():
+            untold = found.get(_untold(figure), {}).get(who, {})
             if figure.endswith(TWO_DEVICES):
-                one = found.get(figure.removesuffix(TWO_DEVICES), {}).get(who, {})
-                rows.append([f"{figure}, over one", who, cell(ratios(two, one), "×")])
+                rows.append([f"{figure}, over its own choice", who, cell(ratios(told, untold), "×")])
+            elif figure.endswith(ONE_DEVICE):
+                rows.append(
+                    [f"{_untold(figure)}, its own choice over one device", who, cell(ratios(untold, told), "×")]
+                )
     acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
     for who in dict.fromkeys(who for values in acting for who in values):
         each = [values[who] for values in acting if who in values]

@@ -19,7 +19,7 @@ import qrl_command
 from bench_contestants import CONTESTANTS, Contestant, chosen
 from bench_install import fingerprint, python_of
 from bench_plot import bars, plot
-from bench_tables import Spread, cell, derived, first_at, page, ratios, spread, to_solve
+from bench_tables import Spread, cell, derived, first_at, page, ratios, speed, spread, to_solve
 from qrl_envs import env as worlds
 
 
@@ -183,9 +183,12 @@ def test_rates_are_held_against_each_other() -> None:
         return run(name, seed, *lines, group="speed")
 
     one = [rates("qrl", s, training=10.0 + s, acting_256=4.0, acting_1024=5.0, acting_4096=4.5) for s in range(3)]
-    two = [rates("qrl, two devices", s, training=20.0) for s in range(2)]
-    text = derived([*one, *two])
-    assert "| training, two devices, over one | qrl | 1.91× [1.82 … 2] |" in text
+    told = [rates("qrl, one device", s, training=5.0) for s in range(2)]
+    peer = [rates("Brax", 0, training=2.0), rates("Brax, two devices", 0, training=4.0)]
+    text = derived([*one, *told, *peer])
+    assert "| training, its own choice over one device | qrl | 2.1× [2 … 2.2] |" in text
+    assert "| training, two devices, over its own choice | Brax | 2× [2 … 2] |" in text
+    assert "| training, two devices | Brax | 4 [4 … 4] | 2.5× [2.5 … 2.5] |" in speed([*one, *told, *peer])
     assert "dearest of 3 numbers of lanes over the cheapest | qrl | 1.25× [1.25 … 1.25] |" in text
     assert derived([]) == ""
 
