@@ -21,6 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from brax import envs
 from brax.training.agents.ppo import networks, train
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 
 import qrl_envs  # noqa: F401 - registers our environments with Brax
 from judge import Act, Judge, pendulum_judge, success_judge
@@ -54,11 +56,14 @@ class Solved(Exception):
 
 
 def mend_jax() -> None:
-    """Brax 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 no longer has."""
+    """Brax 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 no longer has: a copy on each device."""
+
+    def device_put_replicated(tree: Any, devices: list[Any]) -> Any:
+        apart = NamedSharding(Mesh(np.array(devices), ("copy",)), P("copy"))
+        return jax.tree.map(lambda x: jax.device_put(jnp.broadcast_to(x, (len(devices), *jnp.shape(x))), apart), tree)
+
     if not hasattr(jax, "device_put_replicated"):
-        jax.device_put_replicated = lambda tree, devices: jax.tree.map(  # pyright: ignore[reportAttributeAccessIssue]
-            lambda x: jnp.broadcast_to(x, (len(devices), *jnp.shape(x))), tree
-        )
+        jax.device_put_replicated = device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class Truncating(envs.Wrapper):
