@@ -123,7 +123,9 @@ def circumstances(contestant: Contestant) -> dict[str, Any]:
     here = {name: value for name, value in machine().items() if name != "commit"}
     if contestant.environment is None:
         presets = json.dumps([records.preset(name) for name in records.presets()])
-        return here | {"code": hashlib.sha256(f"{figure_runs.sha256()} {presets}".encode()).hexdigest()}
+        scripts = [PEERS / contestant.script, ROOT / "src" / "qrl" / "processes.py"]
+        parts = [figure_runs.sha256(), presets, f"{contestant.devices}", *(path.read_text() for path in scripts)]
+        return here | {"code": hashlib.sha256(json.dumps(parts).encode()).hexdigest()}
     return here | {"requirements": fingerprint(PEERS / f"{contestant.environment}.txt")}
 
 

@@ -3,12 +3,13 @@
 acting     policy 64-64, noise, physics, reward, fresh starts and recording: `rollout.unroll` of hover
 physics    the quadrotor's step alone, thrusts about those of a hover, in blocks of lanes as `rollout.unroll` has them
 learning   samples through draw, gather, symmetries, both networks, V-trace, loss, clip and Adam, in a loop that acts
-           for 1 of 512 updates
+           for 1 of 128 updates
 training   environment steps of the whole loop, each sample learnt from as often as by Brax PPO's defaults (16
            minibatches an unroll, two passes): with unrolls of 50 steps, and of Brax's 10, which makes as many
            optimiser steps a step of the environment
 
-Each over the devices that `qrl train` would make of this machine's cores, or those that JAX_NUM_CPU_DEVICES says.
+All over the devices that `qrl train hover` makes of this machine's cores, or those that JAX_NUM_CPU_DEVICES says. A
+call makes as many steps, whatever the lanes, as training makes many unrolls in one.
 """
 
 import argparse
@@ -101,7 +102,7 @@ def physics(lanes: int, key: jax.Array) -> None:
 
 
 def learning(minibatch_lanes: int, key: jax.Array) -> None:
-    updates = 512
+    updates = 128
     run = hover(minibatch_lanes=minibatch_lanes, updates_per_unroll=updates, warmup_unrolls=1, steps=10**9)
     samples = updates * minibatch_lanes * UNROLL_STEPS
     advancing(f"learning, {minibatch_lanes * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
@@ -125,12 +126,14 @@ def advancing(figure: str, run: runs.RunConfig, unrolls: int, counted: int) -> N
     """How much of what is `counted` in so many unrolls the training loop does."""
     trainer, states, points = begun(run)
     advance = laps.compile_advance(trainer, states, points)
+    full = run.learner.ring_unrolls
+    states = advance(states, points, np.int32(full))
 
     def on(carry: Any) -> Any:
         states, done = carry
         return advance(states, points, np.int32(done + unrolls)), done + unrolls
 
-    rate(figure, counted, on, (states, 0), jax.block_until_ready)
+    rate(figure, counted, on, (states, full), jax.block_until_ready)
 
 
 def begun(run: runs.RunConfig) -> tuple[Trainer, Any, Any]:

@@ -33,13 +33,20 @@ def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     jax.devices()  # one, whatever the first command here would say
 
 
+THREADS = os.environ.get("PJRT_NPROC")
+
+
 @pytest.fixture(autouse=True)
 def _threads() -> Iterator[None]:
-    """What a command in this process says to XLA is not for the next test's processes."""
-    before = os.environ.get("PJRT_NPROC")
-    yield
-    if before is None:
+    """What a command in this process, or a fixture's, says to XLA is not for a test's processes."""
+
+    def as_it_was() -> None:
         os.environ.pop("PJRT_NPROC", None)
+        os.environ.update({} if THREADS is None else {"PJRT_NPROC": THREADS})
+
+    as_it_was()
+    yield
+    as_it_was()
 
 
 def _quickly() -> Iterator[None]:

@@ -62,7 +62,6 @@ def test_evaluate_flies_the_last_checkpoints(trained: Path, tmp_path: Path, caps
     assert qrl("evaluate", run, "--starts", "5") == 0
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_brax_is_imported_for_its_own_tasks_alone() -> None:
     """It takes longer than all else that a command begins with."""
     program = (
@@ -74,6 +73,7 @@ def test_brax_is_imported_for_its_own_tasks_alone() -> None:
     assert said == "[('hover', 4, False), ('pendulum', 1, False), ('fast', 1, True)]\n"
 
 
+@pytest.mark.usefixtures("quick_compilation")
 def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every seed, with a table for each; what is nominal is said as without the flag."""
     task, run = tmp_path / "short.json", tmp_path / "run"

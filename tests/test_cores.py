@@ -8,11 +8,13 @@ from pathlib import Path
 
 import pytest
 
+import campaign
+from frontdoor import TINY
 from qrl import processes, request, runs
 from qrl.config import Config
 from qrl.runs import ConfigFile, RunConfig
 
-CORES = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+CORES = processes._cores()
 LITTLE = {"minibatch_lanes": 8}  # 400 samples of 64 units
 
 
@@ -25,7 +27,7 @@ def config(**changes: object) -> Config:
     [
         ({}, 1, 1, 1),
         ({}, 1, 2, 2),  # 800 samples of 64 units each
-        ({}, 1, 16, 4),
+        ({}, 1, 16, 2),  # more parts of a member were not measured
         ({"minibatch_lanes": 16}, 1, 2, 2),  # 400
         (LITTLE, 1, 2, 1),
         (LITTLE | {"critic_hidden": [256, 256]}, 1, 2, 2),
@@ -46,16 +48,31 @@ def run(**changes: object) -> RunConfig:
     return request.run_config("hover", None, ConfigFile(learner=dict(changes)), {}, 0, 1)
 
 
-@pytest.mark.parametrize("name", processes.SAID)
-def test_what_is_said_stays(name: str) -> None:
-    environment = {name: "3"}
+ONE_THREAD = {"PJRT_NPROC": "1"}
+
+
+@pytest.mark.parametrize(
+    ("said", "added"),
+    [
+        ({"PJRT_NPROC": "3"}, {}),
+        ({"NPROC": "3"}, {}),
+        ({"JAX_NUM_CPU_DEVICES": "3"}, {}),
+        ({"XLA_FLAGS": "--a --xla_force_host_platform_device_count=3"}, {}),
+        ({"JAX_NUM_CPU_DEVICES": "1"}, ONE_THREAD),
+        ({"XLA_FLAGS": "--xla_force_host_platform_device_count=1 --a"}, ONE_THREAD),
+    ],
+    ids=str,
+)
+def test_what_is_said_stays(said: dict, added: dict) -> None:
+    """A device may have one thread, whoever wants it to be one."""
+    environment = dict(said)
     processes.use_cores(run(**LITTLE), [], environment)
-    assert environment == {name: "3"}
+    assert environment == said | added
 
 
 @pytest.mark.parametrize(
     ("changes", "environment"),
-    [(LITTLE, {"PJRT_NPROC": "1"}), ({"shards": 1}, {}), ({"shards": 1, "minibatch_lanes": 8, "lanes": 4096}, {})],
+    [(LITTLE, ONE_THREAD), ({"shards": 1}, {}), ({"shards": 1, "minibatch_lanes": 8, "lanes": 4096}, {})],
     ids=["little", "much", "many lanes"],
 )
 def test_one_thread_for_little_work(changes: dict, environment: dict, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,7 +99,8 @@ print(json.dumps([jax.device_count(), threads]))
 
 def found(changes: dict, before: list[str], **environment: str) -> tuple[int, int]:
     """The devices and the threads of XLA's that there are where a run with `changes` has begun."""
-    alone = {name: x for name, x in os.environ.items() if name not in (*processes.SAID, "XLA_FLAGS")}
+    said = ("JAX_NUM_CPU_DEVICES", "XLA_FLAGS", *processes.THREADS)
+    alone = {name: x for name, x in os.environ.items() if name not in said} | {"JAX_PLATFORMS": "cpu"}
     words = [sys.executable, "-c", PROGRAM, json.dumps([changes, before])]
     said = subprocess.run(words, env=alone | environment, capture_output=True, check=True, text=True).stdout
     devices, threads = json.loads(said.splitlines()[-1])
@@ -106,3 +124,29 @@ def test_xla_does_as_it_is_told() -> None:
     few, many = (found(changes, [])[1] for changes in (LITTLE, {"shards": 1}))
     assert few < many
     assert many >= CORES
+
+
+@pytest.mark.skipif(CORES < 2, reason="one core is one device anyway")
+def test_a_run_has_the_devices_that_it_had(tmp_path: Path) -> None:
+    """Where a command of its own would make one: as it goes on, and as its config.json repeats it."""
+
+    def began(*words: str | Path, **environment: str) -> str:
+        ended = campaign.qrl("train", *words, **environment)
+        campaign.done(ended)
+        return next(line for line in ended.out.splitlines() if " cpu device" in line)
+
+    first, again = tmp_path / "first", tmp_path / "again"
+    assert "on 2 cpu devices" in began("pendulum", *TINY.split(), "--out", first, JAX_NUM_CPU_DEVICES="2")
+    assert "on 1 cpu device " in began("pendulum", *TINY.split(), "--out", tmp_path / "alone")
+    assert "on 2 cpu devices" in began("--config", first / "config.json", "--out", tmp_path / "repeated")
+    again.mkdir()
+    (again / "config.json").write_bytes((first / "config.json").read_bytes())
+    assert "on 2 cpu devices" in began("pendulum", *TINY.split(), "--out", again, "--resume")
+
+
+def test_a_seed_of_several_is_repeated_as_it_was_trained() -> None:
+    """Seeds part first: two on four devices have two each, three on two share both."""
+    devices = [f"TFRT_CPU_{i}" for i in range(4)]
+    for seeds, there, each in ((2, 4, 2), (4, 4, 1), (3, 2, 2), (1, 2, 2), (2, 1, 1), (2, 0, 0)):
+        both = run().model_copy(update={"seeds": seeds, "devices": devices[:there]})
+        assert both.member(0).devices == devices[:each]

@@ -420,7 +420,7 @@ def test_seal_of_another_format(victim: Path, number: float) -> None:
     "begin", ["[", '{"a":', f'{{"format":{FORMAT},"record":[', f'{{"format":{FORMAT},"sha256":{{"a":[']
 )
 def test_seal_of_great_depth(victim: Path, depth: int, begin: str) -> None:
-    assert not with_seal(victim, (begin.replace("FORMAT", str(FORMAT)) * depth).encode())
+    assert not with_seal(victim, (begin * depth).encode())
 
 
 @settings(deadline=None)

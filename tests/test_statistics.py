@@ -41,6 +41,12 @@ def test_far_from_zero_the_variance_keeps_its_digits() -> None:
     np.testing.assert_allclose(ours.variance, np.concatenate(parts).astype(np.float64).var(axis=0), rtol=1e-3)
 
 
+def test_a_first_batch_that_hardly_varies_is_known_exactly() -> None:
+    """The variance of 1 before it must not round it away."""
+    batch = 1e-4 * np.random.default_rng(0).normal(size=(50, F)).astype(np.float32)
+    np.testing.assert_allclose(deviation(merged(none_yet(F), jnp.asarray(batch))), batch.std(axis=0), rtol=1e-5)
+
+
 def test_before_the_first_nothing_is_scaled() -> None:
     assert none_yet(F).n == 0
     np.testing.assert_array_equal(none_yet(F).mean, np.zeros(F))

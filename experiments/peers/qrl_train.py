@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import qrl_envs  # noqa: F401 - registers our environments with Brax
 from judge import Act, Judge, pendulum_judge, success_judge
 from qrl import laps, processes, request, runs
 from qrl.evaluate import summarise

@@ -168,8 +168,7 @@ class Writer:
         self._rows = checkpoint.record.rows
         path = _root(self._folder) / str(checkpoint.env_steps)
         try:
-            # In NumPy once more: Brax's counters turn their parts into device arrays whenever they are put together.
-            state = {name: np.asarray(leaf) for name, leaf in _by_name(checkpoint.state).items()}
+            state = _by_name(checkpoint.state)
             _make_sure_of_room(path, sum(leaf.nbytes for leaf in state.values()))
             self._orbax.save(
                 checkpoint.env_steps,

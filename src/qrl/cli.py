@@ -146,11 +146,11 @@ def main(argv: list[str] | None = None) -> int:
     """Run one command; returns DESIGN.md's exit code: 0 done, 1 failed while running, 2 the input was wrong."""
     args = _parse(argv)
     if args.command == "train":
-        print(f"qrl train {args.task or args.config or ''}: loading JAX and Brax", flush=True)
+        print(f"qrl train {args.task or args.config or ''}: loading JAX", flush=True)
     elif args.command in ("evaluate", "export", "view"):
-        print(f"qrl {args.command} {args.run}: loading JAX and Brax", flush=True)
+        print(f"qrl {args.command} {args.run}: loading JAX", flush=True)
     elif args.command == "sweep":
-        print(f"qrl sweep {args.grid}: loading JAX and Brax", flush=True)
+        print(f"qrl sweep {args.grid}: loading JAX", flush=True)
     try:
         _load()
         from qrl import commands

@@ -3,6 +3,7 @@
 import fcntl
 import math
 import os
+import re
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,7 +19,8 @@ from qrl_envs.specfile import BadInput
 # exchanges where each has 400 samples of 64 units or more; one thread is as fast as XLA's own up to twice that.
 DEVICE_WORK, THREAD_WORK = 400 * 64**2, 1000 * 64**2
 DEVICE_LANES = 512  # stepped by each: worth a device too
-SAID = ("JAX_NUM_CPU_DEVICES", "PJRT_NPROC", "NPROC")  # by the user
+MOST_PARTS = 2  # of a member: with more cores it was not measured
+THREADS = ("PJRT_NPROC", "NPROC")  # by which a user says how many XLA has
 
 
 class Process(NamedTuple):
@@ -60,18 +62,20 @@ def _number(flag: str, value: int | str | None) -> int | None:
 def use_cores(run: RunConfig, before: Sequence[str], environment: MutableMapping[str, str] = os.environ) -> None:
     """Say to JAX how a run uses a CPU's cores, unless the user has: as devices, or with one thread.
 
-    A run that is repeated or goes on has as many devices as `before` names, so that its bits are the same. JAX takes no
-    more advice once it was asked for its devices: to be called before.
+    A run that is repeated or goes on has as many devices as `before` names, if there are so many cores: so that its
+    bits are the same. JAX takes no more advice once it was asked for its devices: to be called before.
     """
-    if any(name in environment for name in SAID) or "device_count" in environment.get("XLA_FLAGS", ""):
+    if any(name in environment for name in THREADS):
         return
     count = cpu_devices(run.learner, run.seeds, _cores())
     if before and all("cpu" in name.lower() for name in before):
         count = min(len(before), _cores())
-    if count > 1:
+    if said := _devices_said(environment):
+        count = said
+    elif count > 1:
         with suppress(RuntimeError):  # it was asked already, by a command before in this process
             jax.config.update("jax_num_cpu_devices", count)
-    elif _work(run.learner) <= THREAD_WORK and run.learner.lanes <= DEVICE_LANES:
+    if count == 1 and _work(run.learner) <= THREAD_WORK and run.learner.lanes <= DEVICE_LANES:
         environment["PJRT_NPROC"] = "1"  # what so little work gains by a second core, threads lose in waiting
 
 
@@ -80,9 +84,16 @@ def cpu_devices(learner: Config, seeds: int, cores: int) -> int:
     for count in range(cores, 1, -1):
         parts = count // math.gcd(seeds, count)  # of a member
         much = _work(learner) >= parts * DEVICE_WORK or learner.lanes >= parts * DEVICE_LANES
-        if parts == 1 or (much and learner.logical_shards % parts == 0):
+        if parts == 1 or (much and parts <= MOST_PARTS and learner.logical_shards % parts == 0):
             return count
     return 1
+
+
+def _devices_said(environment: Mapping[str, str]) -> int:
+    """How many devices of a CPU the user asks for, by JAX's variable or XLA's flag; 0: nothing is said."""
+    flag = re.findall(r"--xla_force_host_platform_device_count=(\d+)", environment.get("XLA_FLAGS", ""))
+    said = environment.get("JAX_NUM_CPU_DEVICES", flag[-1] if flag else "")
+    return int(said) if said.isdigit() else 0
 
 
 def _work(learner: Config) -> int:
@@ -116,8 +127,8 @@ def workers() -> list[Any]:
     """The device of each worker: an accelerator has one; a CPU one for each core that this process may use.
 
     A program of ours keeps about one core busy, and the CPU runs several programs at a time: they need no devices of
-    their own, and so the program is the one that a single run compiles, and its results are the same bits where that
-    has as many threads.
+    their own, and so the program is the one that a single run on one device compiles, and its results are the same bits
+    where that has as many threads.
     """
     devices = jax.local_devices()
     return devices if devices[0].platform != "cpu" else devices[:1] * _cores()

@@ -5,10 +5,9 @@ import math
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from qrl import runs
+from qrl import processes, runs
 from qrl.grid import Grid
 from qrl.runs import RunConfig, comparable
 from qrl.sweep import Result
@@ -112,7 +111,7 @@ def repeat(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
         seed=grid.seeds[order[(len(order) - 1) // 2]],
         seeds=1,
         versions=runs.versions(),
-        devices=[str(device) for device in jax.local_devices()],
+        devices=sorted({str(device) for device in processes.workers()}),
     )
 
 

@@ -31,7 +31,7 @@ class TaskRecord(BaseModel):
 
 
 class ConfigFile(BaseModel):
-    """What CONFIG= may hold: a run's config.json, or any part of one. Versions and devices are for the reader."""
+    """What CONFIG= may hold: a run's config.json, or any part of one. Versions are for the reader."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -58,8 +58,9 @@ class RunConfig(BaseModel):
     devices: list[str]
 
     def member(self, index: int) -> "RunConfig":
-        """The config of one of the seeds trained side by side."""
-        return self.model_copy(update={"seed": self.seed + index, "seeds": 1})
+        """The config of one of the seeds trained side by side, with as many devices as a seed had: seeds part first."""
+        each = len(self.devices) // math.gcd(self.seeds, len(self.devices))
+        return self.model_copy(update={"seed": self.seed + index, "seeds": 1, "devices": self.devices[:each]})
 
     @property
     def sha256(self) -> str:

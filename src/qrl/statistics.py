@@ -36,7 +36,7 @@ def merged(before: Statistics, batch: chex.Array, axis: str | None = None) -> St
     return Statistics(
         n=before.n + size,
         mean=before.mean + share * apart,
-        variance=before.variance + share * (variance - before.variance + (1.0 - share) * jnp.square(apart)),
+        variance=(1.0 - share) * before.variance + share * (variance + (1.0 - share) * jnp.square(apart)),
     )
 
 
