@@ -249,16 +249,17 @@ def test_a_run_leaves_its_lines_and_ends_on_time(tmp_path: Path, monkeypatch: py
 
 def test_a_run_is_made_once(tmp_path: Path) -> None:
     """And again if it failed, was asked for otherwise, or elsewhere."""
-    peer, path = Contestant("peer", "pendulum", "peer.py", ("--steps", "1")), tmp_path / "run.json"
+    peer, path = Contestant("qrl", "pendulum", "qrl_train.py", ("--steps", "1")), tmp_path / "run.json"
     assert not bench.made(path, peer, 60.0)
     here = bench.circumstances(peer)
     assert "commit" not in here
-    asked = {"command": ["peer.py", "--steps", "1"], "budget_seconds": 60.0}
+    asked = {"command": ["qrl_train.py", "--steps", "1"], "budget_seconds": 60.0}
     kept = asked | {"circumstances": here, "outcome": "done"}
     path.write_text(json.dumps(kept))
     assert bench.made(path, peer, 60.0)
     assert not bench.made(path, peer, 90.0)
     assert not bench.made(path, peer._replace(words=("--steps", "2")), 60.0)
+    assert not bench.made(path, peer._replace(devices=2), 60.0)
     for other in ({"CPU": "abacus"}, {"jax": "0.1"}, {"requirements": "others"}, {"code": "other"}):
         path.write_text(json.dumps(kept | {"circumstances": here | other}))
         assert not bench.made(path, peer, 60.0)
