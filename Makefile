@@ -24,7 +24,7 @@ define HELP
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
   make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
        ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE
-  make sweep GRID=experiments/pendulum_lr.json   train every point of a grid; the same command goes on
+  make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; the same command goes on
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
   make figures                       the paper's six figures with captions, from runs that it makes and keeps
@@ -56,7 +56,7 @@ need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
 
 # A run's config.json names its own task.
 $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
-$(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/pendulum_lr.json)
+$(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/grids/pendulum_lr.json)
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
 $(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
 $(call need,view,$(RUN),RUN is missing: make view RUN=runs/circle)
@@ -82,16 +82,16 @@ tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)
 
 figures: $(STAMP)
-	@exec $(VENV)/bin/python experiments/figures.py $(if $(filter-out 0,$(FAST)),--fast) $(ARGS)
+	@exec $(VENV)/bin/python -m experiments.figures.make $(if $(filter-out 0,$(FAST)),--fast) $(ARGS)
 
 ablation: $(STAMP)
-	@exec $(VENV)/bin/python experiments/ablation.py $(ARGS)
+	@exec $(VENV)/bin/python -m experiments.figures.ablation $(ARGS)
 
 gallery: $(STAMP)
-	@exec $(VENV)/bin/python experiments/gallery.py $(if $(filter-out 0,$(FAST)),--fast) $(ARGS)
+	@exec $(VENV)/bin/python -m experiments.gallery.make $(if $(filter-out 0,$(FAST)),--fast) $(ARGS)
 
 bench: $(STAMP)
-	@exec $(VENV)/bin/python experiments/bench.py $(ARGS)
+	@exec $(VENV)/bin/python -m experiments.bench.run $(ARGS)
 
 # Two processes: on the two cores that the ten minutes are promised for. Each begins with half of the tests, those of a
 # file together, for they share what they train; one that is done takes over tests of the other.

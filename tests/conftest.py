@@ -10,8 +10,8 @@ import jax
 import pytest
 from hypothesis import settings
 
-from frontdoor import TINY, qrl
-from machines import need
+from cli_helpers import TINY, qrl
+from cross_targets import need
 from qrl.export import targets
 from qrl.export.targets import Core
 

@@ -149,7 +149,7 @@ JSON
   refuses "make sweep without GRID" "GRID is missing" make sweep
   sed 's/learning_rate/learning_rat/' "$work/grid.json" >"$work/typo_grid.json"
   refuses "a misspelt axis" "typo_grid.json.*learning_rat.*learning_rate" "$qrl" sweep "$work/typo_grid.json" --out "$out/no"
-  refuses "another grid in its folder" "another grid" "$qrl" sweep experiments/pendulum_lr.json --out "$out/sweep"
+  refuses "another grid in its folder" "another grid" "$qrl" sweep experiments/grids/pendulum_lr.json --out "$out/sweep"
   refuses "a grid without room" "points.*GB" "$qrl" sweep "$work/grid.json" --out "$out/no" --memory-gb 1e-6
 }
 

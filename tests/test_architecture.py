@@ -1,7 +1,7 @@
-"""Imports go only downward, and through the doors that are there: experiments -> qrl -> qrl_envs.
+"""Imports go through the doors that are there: experiments -> qrl -> qrl_envs, and inside each from room to room.
 
-A module may import those of its own floor, as long as no circle comes of it, and of the floors below; third-party
-libraries as `ALLOWED` says. Read from the source, so an import inside a function counts like any other.
+`ROOMS` is the table of DESIGN.md, Sec. 1: for each room of the house the rooms and libraries that it may import. Read
+from the source, so an import inside a function counts like any other. Every rule is seen failing (`BROKEN`).
 """
 
 import ast
@@ -14,90 +14,59 @@ from typing import NamedTuple
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = {"qrl": ROOT / "src" / "qrl", "qrl_envs": ROOT / "envs" / "qrl_envs"}
+PACKAGES = {"qrl": ROOT / "src" / "qrl", "qrl_envs": ROOT / "envs" / "qrl_envs"}
 
-# The house. A package's row covers all modules inside it; "__init__" is the room's own.
-FLOORS: dict[str, dict[str, int]] = {
-    "qrl_envs": {
-        "specfile": 0,
-        "rotation": 0,
-        "integrate": 0,
-        "task": 0,
-        "pendulum": 1,
-        "quadrotor": 1,
-        "rewards": 1,
-        "measures": 1,
-        "ports": 1,
-        "symmetry": 1,
-        "controllers": 1,
-        "failures": 1,
-        "env": 2,
-        "conditions": 2,
-        "__init__": 2,
-        "viewer": 3,
-        "pictures": 3,
-    },
+
+class Room(NamedTuple):
+    """What a room may import beside itself and the standard library."""
+
+    rooms: set[str]  # of its own package; "*": all
+    libraries: set[str]  # and, in qrl, what of qrl_envs it may know
+
+
+WORLDS = {"qrl_envs"}
+INPUT = {"qrl_envs.specfile"}  # no world: how wrong input is said
+MATHS = {"jax", "numpy", "chex"}
+
+ROOMS: dict[str, dict[str, Room]] = {
     "qrl": {
-        "__init__": 0,
-        "config": 0,
-        "types": 0,
-        "networks": 1,
-        "vtrace": 1,
-        "objective": 1,
-        "buffer": 1,
-        "statistics": 1,
-        "policy": 1,
-        "export": 1,
-        "peers": 2,
-        "learner": 2,
-        "apg": 2,
-        "rollout": 2,
-        "evaluate": 2,
-        "state": 3,
-        "train": 3,
-        "laps": 3,
-        "loop": 3,
-        "restore": 3,
-        "seal": 3,
-        "checkpoint": 3,
-        "sweep": 3,
-        "sweep_plot": 3,
-        "runs": 3,
-        "tensorboard": 3,
-        "plots": 3,
-        "exits": 4,
-        "request": 4,
-        "terminal": 4,
-        "processes": 4,
-        "axes": 4,
-        "grid": 4,
-        "results": 4,
-        "sweep_command": 4,
-        "export_command": 4,
-        "train_command": 4,
-        "evaluate_command": 4,
-        "view_command": 4,
-        "evaluate_table": 4,
-        "pilots": 4,
-        "deploy": 4,
-        "commands": 4,
-        "cli": 4,
-        "__main__": 4,
+        "__init__": Room(set(), set()),
+        "__main__": Room({"cli"}, set()),
+        "config": Room(set(), {"pydantic", "numpy"} | INPUT),
+        "export": Room(set(), {"numpy"}),
+        "algorithm": Room({"config"}, MATHS | {"flax", "optax"}),
+        "runs": Room({"config"}, MATHS | INPUT | {"orbax", "pydantic", "matplotlib", "tensorboardX"}),
+        "training": Room({"runs", "algorithm", "config"}, MATHS | INPUT),
+        "tasks": Room({"runs", "algorithm", "config"}, MATHS | WORLDS | {"brax"}),
+        "request": Room({"tasks", "training", "runs", "config"}, MATHS | WORLDS),
+        "sweep": Room(
+            {"tasks", "training", "runs", "algorithm", "config"}, MATHS | WORLDS | {"pydantic", "matplotlib"}
+        ),
+        "evaluation": Room({"tasks", "training", "export", "runs", "algorithm", "config"}, MATHS | WORLDS),
+        "cli": Room({"*"}, MATHS | WORLDS | {"rich"}),
+    },
+    "qrl_envs": {
+        "specfile": Room(set(), {"pydantic"}),
+        "rotation": Room(set(), MATHS),
+        "integrate": Room(set(), MATHS),
+        "task": Room({"specfile"}, {"pydantic"}),
+        "pendulum": Room({"task", "integrate"}, MATHS),
+        "quadrotor": Room({"task", "rotation", "integrate"}, MATHS),
+        "rewards": Room({"task", "quadrotor", "pendulum"}, MATHS),
+        "measures": Room({"task"}, MATHS),
+        "io_spec": Room({"task"}, MATHS),
+        "symmetry": Room({"quadrotor"}, MATHS),
+        "controllers": Room({"task", "quadrotor", "rotation"}, MATHS | {"scipy"}),
+        "env": Room({"task", "pendulum", "quadrotor", "rewards", "measures", "symmetry"}, MATHS | {"flax.struct"}),
+        "perturbations": Room({"env", "task", "quadrotor", "rotation"}, MATHS),
+        "viewer": Room({"task", "measures", "io_spec"}, MATHS | {"plotly"}),
+        "plots": Room({"task", "measures"}, MATHS | {"matplotlib"}),
+        "__init__": Room({"env", "task"}, {"brax", "wrapt"}),
     },
 }
-# What each floor may import beside the standard library, on top of what the floors below it may; None: anything.
-ALLOWED: list[set[str] | None] = [
-    {"jax", "numpy", "chex", "flax.struct", "pydantic"},
-    {"flax", "scipy"},
-    {"brax", "optax", "wrapt"},
-    {"orbax", "matplotlib", "tensorboardX"},
-    None,
-]
-COMMAND_LINE = 4  # the floor that joins the learner and the worlds
-ALONE = {"qrl": ("policy", "export")}  # a firmware tool may read these: NumPy, and nothing that needs more
 # A file is data: what would run code that stands in one.
 RUNS_CODE = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "yaml", "runpy", "code"}
-CLOSED = ("experiments", "tests")  # rooms that nobody imports from
+CLOSED = ("experiments", "tests")  # nobody imports from there
 
 
 class Import(NamedTuple):
@@ -106,7 +75,7 @@ class Import(NamedTuple):
 
 
 def name_of(path: Path, room: str, folder: Path) -> str:
-    """ "qrl.cli" of src/qrl/cli.py and of src/qrl/cli/__init__.py; "qrl" of the room's own __init__."""
+    """ "qrl.cli.main" of src/qrl/cli.py and of src/qrl/cli/__init__.py; "qrl" of the room's own __init__."""
     parts = path.relative_to(folder).with_suffix("").parts
     return ".".join((room, *(parts[:-1] if parts[-1] == "__init__" else parts)))
 
@@ -137,62 +106,71 @@ class House:
         self.imports = {name: list(imports_of(path, name)) for name, path in self.paths.items()}
 
     def module(self, name: str) -> str:
-        """The module of ours that the import `name` reads: "qrl.vtrace" for "qrl.vtrace.vtrace"; "" for none."""
+        """The module of ours that the import `name` reads: "qrl.tasks" for "qrl.tasks.environment"; "" for none."""
         while name and name not in self.paths:
             name = name.rpartition(".")[0]
         return name
 
-    def reached_from(self, name: str) -> set[str]:
-        """`name` and whatever of ours it imports, directly or not."""
-        reached, ahead = set(), [name]
-        while ahead:
-            here = ahead.pop()
-            if here not in reached:
-                reached.add(here)
-                ahead += filter(None, (self.module(imported.name) for imported in self.imports[here]))
-        return reached
+
+def room_of(name: str) -> str:
+    """ "algorithm" of "qrl.algorithm.vtrace", "__init__" of "qrl"."""
+    return (name.split(".") + ["__init__"])[1]
 
 
-def floor_of(name: str) -> int | None:
-    room, *rest = name.split(".")
-    return FLOORS[room].get(rest[0] if rest else "__init__")
-
-
-def allowed_on(floor: int, name: str) -> bool:
-    if name.split(".")[0] in sys.stdlib_module_names:
-        return True
-    below = ALLOWED[: floor + 1]
-    return None in below or any(f"{name}.".startswith(f"{lib}.") for libs in below if libs for lib in libs)
+def within(name: str, allowed: set[str]) -> bool:
+    return any(f"{name}.".startswith(f"{prefix}.") for prefix in allowed)
 
 
 def fault(house: House, importer: str, name: str) -> str | None:
     """What is wrong with `importer` importing `name`, if anything is."""
-    here, target = floor_of(importer), house.module(name)
-    room, target_room = importer.split(".")[0], name.split(".")[0]
-    if here is None:
-        return None  # said once, by homeless()
-    if target_room in CLOSED:
+    package, target_package = importer.split(".")[0], name.split(".")[0]
+    room = ROOMS[package].get(room_of(importer))
+    if room is None:
+        return None  # said once, by without_a_room()
+    if target_package in CLOSED:
         return "nobody imports from there"
-    if room == "qrl_envs" and target_room == "qrl":
+    if (package, target_package) == ("qrl_envs", "qrl"):
         return "the worlds never import the learner"
-    if room == "qrl" and target_room == "qrl_envs":
-        return None if here == COMMAND_LINE else "the learner's mathematics never imports a world"
-    if target_room == room:
-        there = floor_of(target) if target else None
-        return f"that is on floor {there}, above" if there is not None and there > here else None
-    return None if allowed_on(here, name) else f"not among the libraries of floor {here}"
+    if target_package == package:
+        target = room_of(name) if room_of(name) in ROOMS[package] else "__init__"
+        open_to = target == room_of(importer) or "*" in room.rooms or target in room.rooms
+        return None if open_to else f"no door from {room_of(importer)} to {target}"
+    if target_package == "qrl_envs":
+        return None if within(name, room.libraries) else f"{room_of(importer)} knows no world"
+    allowed = target_package in sys.stdlib_module_names or within(name, room.libraries)
+    return None if allowed else f"not among the libraries of {room_of(importer)}"
 
 
-def homeless(house: House) -> list[str]:
-    return [f"{name}: unknown here: give it a floor in FLOORS" for name in house.paths if floor_of(name) is None]
-
-
-def upward(house: House) -> list[str]:
+def without_a_room(house: House) -> list[str]:
     return [
-        f"{importer} (floor {floor_of(importer)}), line {line}, imports {name}: {wrong}"
+        f"{name}: unknown here: give it a room in ROOMS"
+        for name in house.paths
+        if room_of(name) not in ROOMS[name.split(".")[0]]
+    ]
+
+
+def doors(house: House) -> list[str]:
+    return [
+        f"{importer}, line {line}, imports {name}: {wrong}"
         for importer, imports in house.imports.items()
         for line, name in imports
         if (wrong := fault(house, importer, name))
+    ]
+
+
+def unused_doors(house: House) -> list[str]:
+    """Doors in the table that no import goes through: the table would allow what the house does not have."""
+    used: set[tuple[str, str, str]] = set()
+    for importer, imports in house.imports.items():
+        for _, name in imports:
+            if target := house.module(name):
+                used.add((importer.split(".")[0], room_of(importer), room_of(target)))
+    return [
+        f"{package}: no import goes from {here} to {there}: close that door"
+        for package, rooms in ROOMS.items()
+        for here, room in rooms.items()
+        for there in room.rooms - {"*"}
+        if (package, here, there) not in used
     ]
 
 
@@ -207,19 +185,6 @@ def circles(house: House) -> list[str]:
     except CycleError as error:
         return [f"a circle: {' -> '.join(error.args[1])}"]
     return []
-
-
-def not_alone(house: House) -> list[str]:
-    faults = []
-    for name in house.paths:
-        room, *rest = name.split(".")
-        if rest and rest[0] in ALONE.get(room, ()):
-            for reached in house.reached_from(name):
-                for line, imported in house.imports[reached]:
-                    root = imported.split(".")[0]
-                    if root not in {*sys.stdlib_module_names, "numpy", room}:
-                        faults.append(f"{name} reaches {imported} ({reached}, line {line}): NumPy alone is allowed")
-    return faults
 
 
 def runs_code(house: House) -> list[str]:
@@ -239,17 +204,16 @@ def runs_code(house: House) -> list[str]:
 
 
 RULES = {
-    "a floor for each": homeless,
-    "downward": upward,
+    "a room for each": without_a_room,
+    "doors": doors,
     "no circles": circles,
-    "NumPy alone": not_alone,
     "files are data": runs_code,
 }
 
 
 @pytest.fixture(scope="module")
 def house() -> House:
-    return House(ROOMS)
+    return House(PACKAGES)
 
 
 @pytest.mark.parametrize("rule", RULES.values(), ids=RULES.keys())
@@ -258,58 +222,92 @@ def test_the_house_keeps(rule, house: House) -> None:
     assert not faults, "\n" + "\n".join(faults)
 
 
-def test_both_rooms_are_read(house: House) -> None:
-    assert {"qrl.vtrace", "qrl.objective", "qrl_envs.quadrotor", "qrl_envs.env"} <= house.paths.keys()
-    assert any(imported.name == "jax.numpy" for imported in house.imports["qrl.vtrace"])
+def test_every_door_is_used(house: House) -> None:
+    faults = unused_doors(house)
+    assert not faults, "\n" + "\n".join(faults)
+
+
+def test_both_packages_are_read(house: House) -> None:
+    assert {
+        "qrl.algorithm.vtrace",
+        "qrl.algorithm.objective",
+        "qrl_envs.quadrotor",
+        "qrl_envs.env",
+    } <= house.paths.keys()
+    assert any(imported.name == "jax.numpy" for imported in house.imports["qrl.algorithm.vtrace"])
 
 
 def test_the_learner_opens_without_a_cost(house: House) -> None:
     assert house.imports["qrl"] == [], "qrl/__init__ imports nothing"
 
 
-# Each rule, seen failing: a file, what it says, and the words that must come of it.
+# Each rule, and each row, seen failing: a file, what it says, and the words that must come of it.
 BROKEN = {
-    "unknown module": ("qrl/brainwave.py", "", homeless, "give it a floor"),
-    "upward": ("qrl/vtrace.py", "from qrl.learner import update", upward, "above"),
-    "upward, relative": ("qrl/vtrace.py", "from .learner import update", upward, "above"),
-    "upward, relative to the package": ("qrl/vtrace.py", "from . import learner", upward, "above"),
-    "upward, inside a function": ("qrl/vtrace.py", "def f():\n    import qrl.learner", upward, "above"),
-    "upward, from a package": ("qrl/buffer/ring.py", "from ..learner import update", upward, "above"),
-    "upward, to the registry": ("qrl_envs/rotation.py", "import qrl_envs", upward, "above"),
-    "learner -> world": ("qrl/learner.py", "from qrl_envs import env", upward, "never imports a world"),
-    "world -> learner": ("qrl_envs/env.py", "import qrl.vtrace", upward, "never import the learner"),
+    "unknown module": ("qrl/brainwave.py", "", without_a_room, "give it a room"),
+    "config": ("qrl/config.py", "from qrl.algorithm.types import Env", doors, "no door from config to algorithm"),
+    "algorithm, a room above": ("qrl/algorithm/vtrace.py", "from qrl.training import state", doors, "no door"),
+    "algorithm, relative": ("qrl/algorithm/vtrace.py", "from ..training import state", doors, "no door"),
+    "algorithm, inside a function": (
+        "qrl/algorithm/vtrace.py",
+        "def f():\n    import qrl.runs.files",
+        doors,
+        "no door",
+    ),
+    "algorithm, a world": ("qrl/algorithm/learner.py", "from qrl_envs import env", doors, "algorithm knows no world"),
+    "algorithm, input": ("qrl/algorithm/learner.py", "from qrl_envs.specfile import BadInput", doors, "knows no world"),
+    "runs": ("qrl/runs/files.py", "from qrl.training.state import TrainState", doors, "no door from runs to training"),
+    "runs, a world": ("qrl/runs/files.py", "from qrl_envs import task", doors, "runs knows no world"),
+    "training": ("qrl/training/loop.py", "from qrl import tasks", doors, "no door from training to tasks"),
+    "tasks": ("qrl/tasks.py", "from qrl import request", doors, "no door from tasks to request"),
+    "request": ("qrl/request.py", "from qrl.sweep import grid", doors, "no door from request to sweep"),
+    "sweep": ("qrl/sweep/grid.py", "from qrl.export import emit", doors, "no door from sweep to export"),
+    "evaluation": ("qrl/evaluation/trained_run.py", "from qrl.cli import terminal", doors, "no door"),
+    "cli, a library": ("qrl/cli/main.py", "import optax", doors, "libraries of cli"),
+    "package, at import": ("qrl/__init__.py", "from qrl.algorithm import learner", doors, "no door from __init__"),
+    "__main__": ("qrl/__main__.py", "from qrl.training import loop", doors, "no door from __main__"),
+    "export needs JAX": ("qrl/export/policy.py", "import jax", doors, "libraries of export"),
+    "export needs a room": (
+        "qrl/export/policy.py",
+        "from qrl.algorithm.types import Env",
+        doors,
+        "no door from export",
+    ),
+    "a test oracle": ("qrl/algorithm/vtrace.py", "import rlax", doors, "libraries of algorithm"),
+    "experiments": ("qrl/cli/main.py", "import experiments.figures", doors, "nobody imports"),
+    "the registry": ("qrl_envs/rotation.py", "import qrl_envs", doors, "no door from rotation"),
+    "world -> learner": ("qrl_envs/env.py", "import qrl.algorithm.vtrace", doors, "never import the learner"),
     "world -> learner, by name": (
         "qrl_envs/env.py",
         "import importlib\nimportlib.import_module('qrl')",
-        upward,
+        doors,
         "never",
     ),
-    "a library above its floor": ("qrl/vtrace.py", "import optax", upward, "libraries of floor 1"),
-    "flax below its floor": ("qrl/types.py", "from flax import linen", upward, "libraries of floor 0"),
-    "a test oracle": ("qrl/vtrace.py", "import rlax", upward, "libraries of floor 1"),
-    "experiments": ("qrl/cli.py", "import experiments.figures", upward, "nobody imports"),
-    "a circle": ("qrl/learner.py", "from qrl.rollout import Lanes", circles, "a circle"),
-    "the state needs its trainer": ("qrl/state.py", "from qrl.train import Trainer", circles, "a circle"),
-    "the learner needs the state": ("qrl/learner.py", "from qrl.state import TrainState", upward, "above"),
-    "policy needs JAX": ("qrl/policy.py", "import jax", not_alone, "NumPy alone"),
-    "pickle": ("qrl/runs.py", "import pickle", runs_code, "pickle runs code"),
-    "pickle, through NumPy": ("qrl/loop.py", "np.load(path, allow_pickle=True)", runs_code, "allow_pickle runs code"),
-    "eval": ("qrl/cli.py", "def value(text):\n    return eval(text)", runs_code, "line 2: eval runs code"),
-    "policy needs JAX elsewhere": ("qrl/policy.py", "from qrl.types import Transition", not_alone, "NumPy alone"),
+    "the plant knows its rewards": ("qrl_envs/quadrotor.py", "from qrl_envs import rewards", doors, "no door"),
+    "a circle": ("qrl/algorithm/rollout.py", "from qrl.algorithm.learner import update", circles, "a circle"),
+    "pickle": ("qrl/runs/files.py", "import pickle", runs_code, "pickle runs code"),
+    "pickle, through NumPy": (
+        "qrl/runs/files.py",
+        "np.load(p, allow_pickle=True)",
+        runs_code,
+        "allow_pickle runs code",
+    ),
+    "eval": ("qrl/cli/main.py", "def value(text):\n    return eval(text)", runs_code, "line 2: eval runs code"),
 }
 SOUND = {
     "qrl/__init__.py": "",
-    "qrl/types.py": "import jax\nfrom flax import struct\nfrom flax.struct import dataclass",
-    "qrl/vtrace.py": "import jax.numpy as jnp\nfrom qrl.types import Transition",
-    "qrl/policy.py": "import json\nimport numpy as np",
-    "qrl/buffer/__init__.py": "",
-    "qrl/rollout.py": "import brax.envs\nfrom qrl.learner import update",
-    "qrl/learner.py": "import optax\nfrom . import vtrace",
-    "qrl/state.py": "from qrl.learner import LearnerState",
-    "qrl/train.py": "from qrl.state import TrainState",
-    "qrl/cli.py": "import re\nimport rich\nimport qrl_envs\nfrom qrl import rollout\nWORD = re.compile('a')",
+    "qrl/config.py": "import pydantic",
+    "qrl/algorithm/types.py": "import jax\nfrom flax import struct\nfrom flax.struct import dataclass",
+    "qrl/algorithm/vtrace.py": "import jax.numpy as jnp\nfrom qrl.algorithm.types import Transition",
+    "qrl/algorithm/learner.py": "import optax\nfrom . import rollout\nfrom qrl.config import Config",
+    "qrl/algorithm/rollout.py": "from .. import config",
+    "qrl/runs/files.py": "from qrl_envs.specfile import BadInput",
+    "qrl/training/state.py": "from qrl.algorithm.learner import LearnerState",
+    "qrl/training/loop.py": "from qrl.training.state import TrainState\nfrom qrl.runs import files",
+    "qrl/export/policy.py": "import json\nimport numpy as np",
+    "qrl/cli/main.py": "import re\nimport rich\nimport qrl_envs\nfrom qrl.training import loop\nWORD = re.compile('a')",
     "qrl_envs/__init__.py": "from qrl_envs import env",
-    "qrl_envs/env.py": "from brax.envs import Env\nfrom qrl_envs.rotation import rotate",
+    "qrl_envs/env.py": "from qrl_envs.quadrotor import step",
+    "qrl_envs/quadrotor.py": "import jax",
     "qrl_envs/rotation.py": "import jax",
 }
 
@@ -319,7 +317,7 @@ def build(folder: Path, files: dict[str, str]) -> House:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    return House({room: folder / room for room in ROOMS})
+    return House({package: folder / package for package in PACKAGES})
 
 
 def test_a_sound_house_passes(tmp_path: Path) -> None:

@@ -2,6 +2,6 @@
 
 import sys
 
-from qrl.cli import main
+from qrl.cli.main import main
 
 sys.exit(main())

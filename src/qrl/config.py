@@ -5,7 +5,9 @@ differ in them alone share one program; static ones (shapes, counts, choices, wh
 shape the program.
 """
 
+import json
 import math
+from importlib import resources
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -169,3 +171,17 @@ class Config(BaseModel):
 
 
 TRACED = tuple(name for name, field in Config.model_fields.items() if "traced" in field.metadata)
+
+
+def load_preset(name: str) -> dict[str, Any]:
+    """The learner's defaults laid under the preset `name` ("default" for a task without one of its own)."""
+    folder = resources.files("qrl").joinpath("presets")
+    data = json.loads(folder.joinpath("default.json").read_text(encoding="utf-8"))
+    if name != "default":
+        data |= json.loads(folder.joinpath(f"{name}.json").read_text(encoding="utf-8"))
+    return data
+
+
+def preset_names() -> list[str]:
+    folder = resources.files("qrl").joinpath("presets")
+    return sorted(entry.name.removesuffix(".json") for entry in folder.iterdir() if entry.name.endswith(".json"))

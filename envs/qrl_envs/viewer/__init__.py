@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qrl_envs import measures, ports
+from qrl_envs import io_spec, measures
 from qrl_envs.measures import Measured
 from qrl_envs.task import CircleReward, Motor, PendulumTask, QuadrotorTask, Task
 
@@ -27,7 +27,7 @@ POLICY = "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-sr
 
 
 class Flown(NamedTuple):
-    """Flights to look at, as `qrl.evaluate.Flights` has them; n flights of K control periods."""
+    """Flights to look at, as `qrl.algorithm.flights.Flights` has them; n flights of K control periods."""
 
     starts: Sequence[int]  # [n] by which the page names them
     observations: np.ndarray  # [n, K + 1, F] SI units; NaN from where a flight ended early
@@ -137,7 +137,7 @@ def _described(panel: Panel) -> dict[str, Any]:
 
 def _in_units(task: Task, actions: np.ndarray) -> np.ndarray:
     """The N or N m applied for `actions` [..., A] in [−1, 1]."""
-    acted = ports.actions(task)
+    acted = io_spec.actions(task)
     offset, scale, low, high = (
         np.array([getattr(port, name) for port in acted]) for name in ("offset", "scale", "low", "high")
     )

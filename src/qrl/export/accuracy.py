@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from qrl.policy import Policy
+from qrl.export.policy import Policy
 
 CHUNK = 8192  # observations at a time: the intermediate arrays stay in the cache
 

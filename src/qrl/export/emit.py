@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from qrl.export import kernel as reference
 from qrl.export import vectors
 from qrl.export.kernel import Dense, Ints, Kernel
-from qrl.policy import Policy
+from qrl.export.policy import Policy
 
 FORMAT = 1
 FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"

@@ -11,9 +11,9 @@ import numpy as np
 from qrl.export import baseline, targets, vectors
 from qrl.export import kernel as reference
 from qrl.export.kernel import Kernel
+from qrl.export.policy import Policy
 from qrl.export.quantise import si_layers
 from qrl.export.targets import CORES, FIRMWARE, STRICT, Core, Counts, Outputs, ProofFailed
-from qrl.policy import Policy
 
 BASELINE_VECTORS = 20
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden, step
-from qrl.policy import ACTIVATIONS, Layer, Policy
+from qrl.export.policy import ACTIVATIONS, Layer, Policy
 
 Floats = NDArray[np.float64]
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from qrl.export.accuracy import Accuracy
 from qrl.export.kernel import Kernel, accumulator_bound
+from qrl.export.policy import Policy
 from qrl.export.prove import Proof
-from qrl.policy import Policy
 
 
 class Flown(NamedTuple):

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrl.export.kernel import INT16, Kernel
-from qrl.policy import Policy
+from qrl.export.policy import Policy
 
 EXTREME = (0.0, -0.0, 1e-45, 1e-38, 1e-7, 1e7, 1e20, 3.4028235e38, np.inf, np.nan)  # each with either sign
 

@@ -1,0 +1,147 @@
+"""A few flights in full: where they went, and two quantities over time."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from qrl_envs import measures
+from qrl_envs.plots.frame import COLOURS, INK, empty, finish, in_pi, legend
+from qrl_envs.plots.measured import successes
+from qrl_envs.plots.overtime import Panel, logarithmic, over_time
+from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
+
+SHOWN = 5  # flights drawn in full
+
+
+def draw(path: Path, task: Task, observations: np.ndarray) -> None:
+    """Draw the first few flights of `observations` [n, K + 1, F], SI units, at times 0, dt, … K·dt."""
+    figure(task, observations).savefig(path, format="png")
+
+
+def figure(task: Task, observations: np.ndarray) -> Figure:
+    """What `draw` saves. Axes: where the first few went, and two quantities over time."""
+    found = measures.of_flights(task, observations)
+    shown = np.where(np.isfinite(observations), observations, np.nan)[:SHOWN]
+    figure = empty(task, height_in=5.0)
+    left, upper, lower = figure.subplot_mosaic("AB;AC", width_ratios=(1.0, 1.2)).values()
+    if isinstance(task, PendulumTask):
+        _phase_portrait(left, task, shown)
+        panels = _pendulum_panels(task, shown)
+    else:
+        _seen_from_above(left, task, shown)
+        panels = _quadrotor_panels(task, shown, found.errors)
+    for axes, panel in zip((upper, lower), panels, strict=True):
+        times = over_time(axes, task, panel)
+        for colour, values in zip(COLOURS, panel.values, strict=False):
+            for line in _turns(values) if panel.scale == "angle" else [values]:
+                axes.plot(times, line, color=colour, linewidth=1.4)
+    finish(left, f"the first {len(shown)} of {len(observations):,} flights")
+    finish(upper, successes(found))
+    finish(lower)
+    legend(figure)
+    return figure
+
+
+# Where flights went
+
+
+def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None:
+    """Paths of `shown` [few, K + 1, 18] over the ground; the triangle at a start points as the vehicle's top does."""
+    wanted, reach = task.evaluation.reward, 0.0
+    for colour, path in zip(COLOURS, shown[:, :, 9:11], strict=False):
+        axes.plot(*path.T, color=colour, linewidth=1.4)
+    starts, up = shown[:, 0, 9:11], shown[:, 0, 8]  # r33: the body's z axis along the world's
+    for marker, label, among in (("^", "start upright", up >= 0), ("v", "start upside down", up < 0)):
+        colours = np.array(COLOURS)[: len(among)][among]
+        axes.scatter(*starts[among].T, c=colours, marker=marker, s=90, edgecolors="white", zorder=4)
+        if among.any():
+            axes.plot([], [], marker, color=INK, markersize=8, label=label)
+    if isinstance(wanted, CircleReward):
+        _circle(axes, wanted)
+        reach = wanted.radius_m
+    else:
+        axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="wanted position")
+    half = _half_width(shown[:, :, 9:11], reach, task.evaluation.start.position_m)
+    axes.set(xlabel="x [m], seen from above", ylabel="y [m]", aspect="equal", xlim=(-half, half), ylim=(-half, half))
+
+
+def _circle(axes: Axes, wanted: CircleReward) -> None:
+    """The circle to fly, dashed, and which way round."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    x, y = wanted.radius_m * np.cos(angle), wanted.radius_m * np.sin(angle)
+    axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="wanted path")
+    arrow = {"arrowstyle": "-|>", "color": "black", "mutation_scale": 22, "shrinkA": 0, "shrinkB": 0}
+    for k in (22, 112):
+        axes.annotate("", xy=(x[k + 3], y[k + 3]), xytext=(x[k], y[k]), arrowprops=arrow, zorder=6)
+    axes.text(0, 0, f"{wanted.speed_m_s:g} m/s", ha="center", va="center", color=INK, fontsize=11)
+
+
+def _half_width(paths: np.ndarray, reach_m: float, start_m: float) -> float:
+    """Of a window on `paths` [n, K + 1, 2] that shows the target and the starts; what flees farther leaves it."""
+    extent = np.max(np.abs(paths), initial=0.0, where=np.isfinite(paths))
+    return 1.12 * max(min(extent, 2.0 * (start_m + reach_m)), reach_m, 0.1)
+
+
+def _phase_portrait(axes: Axes, task: PendulumTask, shown: np.ndarray) -> None:
+    """Rate over angle of `shown` [few, K + 1, 3]."""
+    for colour, theta, rate in zip(COLOURS, _angle(shown), shown[:, :, 2], strict=False):
+        for line in _turns(theta):
+            axes.plot(line, rate, color=colour, linewidth=1.4)
+        axes.plot(theta[0], rate[0], "o", color=colour, markeredgecolor="white", markersize=10, zorder=4)
+    axes.plot([], [], "o", color=INK, markersize=8, label="start")
+    axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="upright, at rest")
+    top = 1.1 * task.rod.max_rate_rad_s
+    axes.set(xlabel="angle from upright [rad]", ylabel="rate [rad/s]", xlim=(-np.pi, np.pi), ylim=(-top, top))
+    in_pi(axes.xaxis)
+
+
+def _angle(shown: np.ndarray) -> np.ndarray:
+    """From upright, in ±π, of `shown` [n, K + 1, 3]: [n, K + 1]."""
+    return np.arctan2(shown[:, :, 1], shown[:, :, 0])
+
+
+def _turns(angle: np.ndarray) -> list[np.ndarray]:
+    """Lines for an axis of ±π: the unwrapped `angle` [K + 1] shifted by each whole turn that brings a part into view.
+
+    So no line jumps across the axis, and none stops short of its edge.
+    """
+    whole = np.unwrap(angle)
+    turns = np.round(whole[np.isfinite(whole)] / (2.0 * np.pi))
+    return [whole - 2.0 * np.pi * turn for turn in np.unique(turns)]
+
+
+# Quantities over time
+
+
+def _quadrotor_panels(task: QuadrotorTask, shown: np.ndarray, errors: dict[str, np.ndarray]) -> tuple[Panel, Panel]:
+    spec, wanted = task.evaluation, task.evaluation.reward
+    few = {name: np.where(np.isfinite(error), error, np.nan)[: len(shown)] for name, error in errors.items()}
+    if isinstance(wanted, CircleReward) and spec.speed_m_s is not None:
+        distance, speed = np.hypot(few["radius_m"], few["height_m"]), few["speed_m_s"] + wanted.speed_m_s
+        return (
+            logarithmic("distance to circle", "m", distance, spec.distance_m),
+            Panel("tangential speed", "m/s", speed, _limits(speed, wanted.speed_m_s), wanted.speed_m_s, spec.speed_m_s),
+        )
+    tilt = np.degrees(np.arccos(np.clip(shown[:, :, 8], -1.0, 1.0)))
+    return (
+        logarithmic("distance to target", "m", few["position_m"], spec.distance_m),
+        Panel("tilt", "°", tilt, (0.0, 180.0)),
+    )
+
+
+def _pendulum_panels(task: PendulumTask, shown: np.ndarray) -> tuple[Panel, Panel]:
+    spec, top = task.evaluation, 1.1 * task.rod.max_rate_rad_s
+    return (
+        Panel("angle", "rad", _angle(shown), (-np.pi, np.pi), 0.0, spec.angle_rad, "angle"),
+        Panel("rate", "rad/s", shown[:, :, 2], (-top, top), 0.0, spec.rate_rad_s),
+    )
+
+
+def _limits(speed: np.ndarray, wanted: float) -> tuple[float, float]:
+    """Of an axis that shows `speed` as far as it lies between −1 and 3 times the one that is wanted."""
+    seen = np.isfinite(speed)
+    low = np.min(speed, initial=0.5 * wanted, where=seen)
+    high = np.max(speed, initial=1.5 * wanted, where=seen)
+    return max(low - 0.1 * wanted, -wanted), min(high + 0.1 * wanted, 3.0 * wanted)

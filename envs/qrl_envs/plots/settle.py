@@ -1,0 +1,105 @@
+"""How long flights take to settle, by how they began: a map over the start's tilt and speed."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MultipleLocator
+
+from qrl_envs import measures
+from qrl_envs.measures import speed_m_s, tilt_deg
+from qrl_envs.plots.frame import INK, SHADE, empty, finish, legend
+from qrl_envs.plots.measured import successes
+from qrl_envs.task import QuadrotorTask
+
+TILT_EDGES_DEG = np.linspace(0.0, 180.0, 13)
+SPEEDS = 8  # cells
+LEAST = 3  # flights that a cell's median is of
+FAILED = "#D55E00"
+MANY = 50  # crosses that may be large
+
+
+def draw(path: Path, task: QuadrotorTask, observations: np.ndarray) -> None:
+    """Draw when all of `observations` [n, K + 1, 18], SI units, at times 0, dt, … K·dt, settle."""
+    figure(task, observations).savefig(path, format="png")
+
+
+def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
+    """What `draw` saves. Axes: the map, and its colour bar."""
+    found = measures.of_flights(task, observations)
+    tilt, speed = tilt_deg(observations[:, 0]), speed_m_s(observations[:, 0])
+    figure = empty(task, height_in=5.6)
+    axes = figure.subplots()
+    most = max(float(np.max(speed, initial=0.0, where=np.isfinite(speed))), 1e-3)
+    edges = np.linspace(0.0, most * (1 + 1e-6), SPEEDS + 1)
+    cells = medians(tilt, speed, np.where(found.success, found.settle_s, np.inf), edges)
+    _map(figure, axes, cells, edges)
+    failed = ~found.success
+    if failed.any():
+        axes.plot(
+            tilt[failed],
+            speed[failed],
+            "x",
+            color=FAILED,
+            markersize=9 if failed.sum() <= MANY else 5,
+            markeredgewidth=2.2 if failed.sum() <= MANY else 1.2,
+            label="a start that fails",
+            clip_on=False,
+        )
+    axes.fill_between([], [], color=SHADE, label=f"fewer than {LEAST} flights")
+    axes.set(
+        xlabel="tilt at the start [°]", ylabel="speed at the start [m/s]", xlim=(0.0, 180.0), ylim=(0.0, edges[-1])
+    )
+    axes.xaxis.set_major_locator(MultipleLocator(30.0))
+    finish(axes, f"time to settle by how a flight began; {successes(found)}")
+    axes.grid(visible=False)
+    axes.set_facecolor(SHADE)
+    legend(figure)
+    return figure
+
+
+def medians(tilt: np.ndarray, speed: np.ndarray, settle_s: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Of each cell [speeds, tilts] the median settle time [s], for tilt [°], speed [m/s] and settle_s [n] of n flights.
+
+    NaN where there are fewer than LEAST; infinite where half of them or more never settle.
+    """
+    column, row = np.digitize(tilt, TILT_EDGES_DEG) - 1, np.digitize(speed, edges) - 1
+    column = np.minimum(column, len(TILT_EDGES_DEG) - 2)  # right upside down
+    cells = np.full((len(edges) - 1, len(TILT_EDGES_DEG) - 1), np.nan)
+    for i, j in np.ndindex(cells.shape):
+        here = settle_s[(row == i) & (column == j)]
+        if len(here) >= LEAST:
+            cells[i, j] = np.sort(here)[len(here) // 2]
+    return cells
+
+
+def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> None:
+    """The cells in colours, each with its number."""
+    settled = cells[np.isfinite(cells)]
+    low, high = (settled.min(), settled.max()) if len(settled) else (0.0, 1.0)
+    high = max(high, low + 0.1)
+    shown = np.ma.masked_invalid(cells)
+    colours = axes.pcolormesh(
+        TILT_EDGES_DEG, edges, shown, cmap="cividis", vmin=low, vmax=high, edgecolors="white", linewidth=0.8
+    )
+    bar = figure.colorbar(colours, ax=axes, pad=0.02)
+    bar.set_label("median time to settle [s]", fontsize=11)
+    bar.ax.tick_params(labelsize=10.5)
+    for i, j in np.ndindex(cells.shape):
+        if np.isnan(cells[i, j]):
+            continue
+        never = np.isinf(cells[i, j])
+        dark = not never and cells[i, j] < (low + high) / 2
+        axes.text(
+            float(TILT_EDGES_DEG[j] + TILT_EDGES_DEG[j + 1]) / 2,
+            float(edges[i] + edges[i + 1]) / 2,
+            "never" if never else f"{cells[i, j]:.2g}" if cells[i, j] < 10 else f"{cells[i, j]:.0f}",
+            ha="center",
+            va="center",
+            fontsize=9.5,
+            color="white" if dark else INK,
+            zorder=5,
+            path_effects=[] if not never else [withStroke(linewidth=3, foreground="white")],  # over the crosses
+        )

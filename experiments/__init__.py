@@ -1,0 +1,1 @@
+"""The runs: benchmarks, figures, gallery, profiles."""

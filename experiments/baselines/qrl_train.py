@@ -1,0 +1,82 @@
+"""qrl itself, in one process: `qrl_train.py pendulum|hover|circle --seed N [--preset NAME] [--no-apg] [--checks N]`.
+
+The preset (TASK_fast where it ships, else the task's own) says how many steps there are: step size and noise follow its
+schedule, so that a policy is best at its end. It is checked `--checks` times on the way, as the other contestants are.
+"""
+
+import argparse
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from judge import Act, Judge, pendulum_judge, success_judge
+from qrl import request, tasks
+from qrl.algorithm.flights import summarise
+from qrl.config import load_preset, preset_names
+from qrl.runs import record
+from qrl.training import devices, driver
+from qrl.training.sharding import spread
+from qrl.training.state import point, stack
+from qrl.training.trainer import Trainer
+
+STARTS, EVALUATION_STARTS_SEED = 1000, 1_000_003  # those of `qrl evaluate`
+
+
+def contestant(
+    task: str, preset: str | None, seed: int, flags: dict[str, Any]
+) -> tuple[Trainer, Any, record.RunConfig]:
+    """What trains, at which point, and how it was asked for."""
+    fast = f"{task}_fast"
+    name = preset or (fast if fast in preset_names() else task)
+    run = request.run_config(task, None, record.ConfigFile(learner=load_preset(name)), flags, seed, 1)
+    devices.use_cores(run, [])
+    env = tasks.environment(run.task)
+    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.logical_shards))
+    return trainer, stack([point(env, run.learner)]), run
+
+
+def pendulum_judged(trainer: Trainer) -> Callable[[Any], Act]:
+    """The policy that ships as a function of observations in NumPy; compiled once."""
+    learner = trainer.learner
+    mean = jax.jit(lambda state, o: jnp.clip(learner.mean(learner.shipped(state), o), -1.0, 1.0))
+    return lambda member: lambda observation: np.asarray(mean(member, jnp.asarray(observation, jnp.float32)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("task", choices=["pendulum", "hover", "circle"])
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--preset")
+    parser.add_argument("--no-apg", action="store_true", help="the paper's method to the end")
+    parser.add_argument("--checks", type=int, default=20)
+    args = parser.parse_args()
+    flags = {"apg_fraction": 0.0} if args.no_apg else {}
+    trainer, points, run = contestant(args.task, args.preset, args.seed, flags)
+    config = run.learner
+    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
+
+    def flights(learners: Any) -> dict[str, float]:
+        return summarise(jax.tree.map(lambda x: x[0], trainer.fly(learners, points, keys)))
+
+    judge: Judge = pendulum_judge() if args.task == "pendulum" else success_judge(flights)
+    judged = pendulum_judged(trainer)
+    judge.hear_jax().start()
+    states = trainer.init(driver.seeds(run.seed, 1), points)
+    advance, climb = driver.compile_advance(trainer, states, points), driver.compile_climb(trainer, states, points)
+    pieces = min(args.checks, config.unrolls)
+    for until in sorted({round(config.unrolls * (i + 1) / pieces) for i in range(pieces)} | {config.learning_unrolls}):
+        on = advance if until <= config.learning_unrolls else climb
+        states = jax.block_until_ready(on(states, points, np.int32(until)))
+        learners = states.learner
+        policy = (
+            judged(jax.tree.map(lambda x: x[0], trainer.on_host(learners))) if args.task == "pendulum" else learners
+        )
+        if judge.check(until * config.unroll_size, policy):
+            break
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Timings of qrl beside other trainers and simulators."""

@@ -1,0 +1,62 @@
+"""Who is timed at what: one line each. Scripts and their environments' requirements: experiments/baselines."""
+
+from typing import NamedTuple
+
+GROUPS = {
+    "pendulum": "Pendulum-v1, until the mean return of 1,000 starts reaches −150",
+    "hover": "hover, until 99 % of 1,000 starts succeed",
+    "circle": "circle, until 99 % of 1,000 starts succeed",
+    "commands": "whole commands with the defaults that ship, the last policy judged",
+    "speed": "steps and samples a second",
+}
+
+
+class Contestant(NamedTuple):
+    name: str
+    group: str
+    script: str
+    words: tuple[str, ...] = ()
+    environment: str | None = None  # requirements of that name; None: qrl's own
+    devices: int | None = None  # of the CPU, as JAX is told; None: as the contestant itself says
+
+
+QRL = "qrl"  # how a group's own contestant, which ratios are to, begins
+
+CONTESTANTS = (
+    Contestant("qrl", "pendulum", "qrl_train.py", ("pendulum",)),
+    Contestant("Brax PPO", "pendulum", "brax_ppo.py", ("pendulum", "--steps", "1e6"), "brax"),
+    Contestant("rejax SAC", "pendulum", "rejax_agent.py", ("sac", "--steps", "2e4"), "rejax"),
+    Contestant("rejax PPO", "pendulum", "rejax_agent.py", ("ppo", "--steps", "1e6"), "rejax"),
+    Contestant("sbx SAC", "pendulum", "sbx_sac.py", ("--steps", "2e4"), "sbx"),
+    Contestant("rltools SAC", "pendulum", "rltools_sac.py", ("--steps", "2e4"), "rltools"),
+    Contestant("qrl", "hover", "qrl_train.py", ("hover",)),
+    Contestant("qrl without APG", "hover", "qrl_train.py", ("hover", "--no-apg")),
+    Contestant("Brax PPO", "hover", "brax_ppo.py", ("hover", "--steps", "4e6"), "brax"),
+    Contestant("qrl", "circle", "qrl_train.py", ("circle",)),
+    Contestant("qrl without APG", "circle", "qrl_train.py", ("circle", "--no-apg")),
+    Contestant("Brax PPO", "circle", "brax_ppo.py", ("circle", "--steps", "3e6"), "brax"),
+    Contestant("qrl train pendulum", "commands", "qrl_command.py", ("pendulum",)),
+    Contestant("qrl train hover", "commands", "qrl_command.py", ("hover",)),
+    Contestant("qrl train circle", "commands", "qrl_command.py", ("circle",)),
+    Contestant("qrl", "speed", "../throughput.py"),
+    Contestant("qrl, one device", "speed", "../throughput.py", ("--only", "training"), devices=1),
+    Contestant("Brax", "speed", "brax_speed.py", (), "brax"),
+    Contestant("Brax, two devices", "speed", "brax_speed.py", ("--only", "training"), "brax", devices=2),
+    Contestant("crazyflow", "speed", "crazyflow_physics.py", ("first_principles",), "crazyflow"),
+    Contestant("crazyflow so_rpy", "speed", "crazyflow_physics.py", ("so_rpy",), "crazyflow"),
+    Contestant("qrl command", "speed", "qrl_startup.py", ("hover",)),
+)
+
+
+def key(contestant: Contestant) -> str:
+    """What a contestant is called in files and on the command line: `pendulum/brax-ppo`."""
+    return f"{contestant.group}/{contestant.name.lower().replace(',', '').replace(' ', '-')}"
+
+
+def chosen(words: list[str]) -> list[Contestant]:
+    """Those that `words` (groups, or keys as `key` makes them) name, in the table's order; ValueError, in a line."""
+    known = {key(contestant) for contestant in CONTESTANTS} | GROUPS.keys()
+    for word in words:
+        if word not in known:
+            raise ValueError(f"--only: unknown contestant '{word}' (known: {', '.join(sorted(known))})")
+    return [c for c in CONTESTANTS if not words or {key(c), c.group} & set(words)]

@@ -1,0 +1,99 @@
+"""The ratios as one picture: how many times qrl's time a peer takes, or how many times its rate qrl reaches."""
+
+import math
+import textwrap
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+from experiments.bench.tables import BARS, QRL, Run, Spread, by_seed, figures, number, ratios, untold
+
+COLOURS = {"training": "#0072B2", "total": "#E69F00", "speed": "#009E73"}  # of Okabe and Ito
+NAMES = {
+    "training": "training seconds, theirs / qrl's",
+    "total": "seconds from start to solved, theirs / qrl's",
+    "speed": "steps a second, qrl's / theirs",
+}
+
+
+class Bar(NamedTuple):
+    label: str
+    kind: str
+    ratio: Spread
+    bound: bool  # the peer did not come so far: the ratio is at least this
+
+
+def bars(runs: list[Run]) -> list[Bar]:
+    """A bar for each ratio that is there; for a peer that mostly failed, what its budget says at least."""
+    found: list[Bar] = []
+    for group in BARS:
+        mine = [run for run in runs if run["group"] == group]
+        for who in dict.fromkeys(run["contestant"] for run in mine if run["contestant"] != QRL):
+            for kind, clock in (("training", "train_seconds"), ("total", "total_seconds")):
+                theirs, ours = by_seed(mine, who, clock), by_seed(mine, QRL, clock)
+                spent = {r["seed"]: r["lines"][-1][clock] for r in mine if r["contestant"] == who and r["lines"]}
+                ratio = ratios(theirs, ours)
+                bound = ratio is not None and not math.isfinite(ratio.median)
+                if ratio and not math.isfinite(ratio.greatest):
+                    ratio = ratios(
+                        {s: v if math.isfinite(v) else spent.get(s, math.nan) for s, v in theirs.items()}, ours
+                    )
+                if ratio and math.isfinite(ratio.median):
+                    found.append(Bar(f"{group}: {who}", kind, ratio, bound))
+    rates = figures([run for run in runs if run["group"] == "speed"])
+    for figure, values in rates.items():
+        ours = rates.get(untold(figure), {}).get(QRL, {})
+        for who in values:
+            if who != QRL and (ratio := ratios(ours, values[who])):
+                found.append(Bar(f"{figure}: {who}", "speed", ratio, False))
+    return found
+
+
+def plot(path: Path, runs: list[Run]) -> None:
+    """Horizontal bars on a logarithmic axis, whiskers from least to greatest; nothing where there is no ratio."""
+    found = bars(runs)
+    if not found:
+        return
+    figure, axes = plt.subplots(figsize=(9.0, 1.4 + 0.3 * len(found)), layout="constrained")
+    for y, bar in enumerate(found):
+        low, high = bar.ratio.median - bar.ratio.least, bar.ratio.greatest - bar.ratio.median
+        axes.barh(
+            y,
+            bar.ratio.median - 1.0,
+            left=1.0,
+            height=0.7,
+            color="white" if bar.bound else COLOURS[bar.kind],
+            edgecolor=COLOURS[bar.kind],
+            hatch="///" if bar.bound else None,
+            xerr=[[low], [high]],
+            ecolor="#333333",
+            capsize=2,
+        )
+        told = f"{'> ' if bar.bound else ''}{number(bar.ratio.median)}×"
+        axes.annotate(
+            told, (max(bar.ratio.greatest, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8
+        )
+    axes.set_xscale("log")
+    axes.axvline(1.0, color="#333333", linewidth=1.0)
+    axes.set_yticks(range(len(found)), [textwrap.fill(bar.label, 48) for bar in found], fontsize=8)
+    axes.invert_yaxis()
+    axes.margins(x=0.12, y=0.01)
+    axes.set_xlabel(
+        "times qrl (median, range over seeds)\nhatched: not solved within the budget, so at least this", fontsize=9
+    )
+    kinds = [kind for kind in COLOURS if any(bar.kind == kind for bar in found)]
+    patches = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[kind]) for kind in kinds]
+    axes.legend(
+        patches,
+        [NAMES[kind] for kind in kinds],
+        fontsize=8,
+        loc="upper center",
+        bbox_to_anchor=(0.4, -1.1 / (0.3 * len(found))),
+    )
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,212 @@
+"""From runs to medians, ranges and ratios, and to a page of tables.
+
+A run is what one process left: {"contestant", "group", "seed", "outcome", "lines"}; a line is a check or a figure.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.bench.contestants import GROUPS, QRL
+
+Run = dict[str, Any]
+CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
+BARS = {"pendulum": ("return_mean", -150.0), "hover": ("success", 0.99), "circle": ("success", 0.99)}
+ONE_DEVICE, TWO_DEVICES = ", one device", ", two devices"  # how such a contestant's name, and so its figures, end
+EASIER_PENDULUM = -160.0  # at which the field's figures were taken
+TUNED = (
+    "**Whose settings.** qrl races with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
+    " `circle_fast`); its commands use the presets that ship as these tasks' defaults. On hover and circle these end"
+    " with the gradient of flights through the simulator (APG), which no peer here is given; a step so flown counts as"
+    " a step; *qrl without APG* is the same presets without it. qrl makes a device of each core, or has XLA use one"
+    " thread where its minibatches are small, as `qrl train` does; every other contestant has the devices and threads"
+    " that it chooses. Brax PPO's were tuned by hand for the pendulum, as"
+    " Brax ships none that suit; on hover and circle it has the same with more lanes and a longer horizon, and no"
+    " search was made there. rejax: its own for this task. sbx: the RL Zoo's for this task. rltools: the package's"
+    " defaults, made for this task. Rates: in a call qrl acts for 16,384 × 50 steps, or moves as many; a"
+    " peer makes an unroll."
+)
+
+
+class Spread(NamedTuple):
+    """Median and range; infinite where a run did not come so far."""
+
+    median: float
+    least: float
+    greatest: float
+
+
+def spread(values: Iterable[float]) -> Spread:
+    """Of at least one value; the median of an even number is the mean of two."""
+    ordered = np.sort(np.fromiter(values, float))
+    return Spread(float(np.median(ordered)), float(ordered[0]), float(ordered[-1]))
+
+
+def first_at(run: Run, name: str, bar: float) -> dict[str, float] | None:
+    """A run's first check at which `name` is at least `bar`; what is no number never is."""
+    return next((line for line in run["lines"] if line.get(name) is not None and line[name] >= bar), None)
+
+
+def to_solve(run: Run, clock: str, bar: float | None = None) -> float:
+    """What `clock` said when the run's task was solved; infinite if it never was."""
+    name, usual = BARS[run["group"]]
+    line = first_at(run, name, usual if bar is None else bar)
+    return math.inf if line is None else float(line.get(clock, math.nan))
+
+
+def ratios(theirs: dict[int, float], ours: dict[int, float]) -> Spread | None:
+    """Of values by seed, each over ours of the same round (run one after the other); None: no round has both.
+
+    Where ours is infinite the ratio says nothing, and that round is left out.
+    """
+    both = [theirs[seed] / ours[seed] for seed in theirs if seed in ours and 0 < ours[seed] < math.inf]
+    return spread(both) if both else None
+
+
+def number(value: float) -> str:
+    """Three digits, or a dash for what never happened."""
+    if not math.isfinite(value):
+        return "–"
+    if value and abs(value) < 100:
+        return f"{value:.3g}"
+    return f"{value:,.0f}" if abs(value) < 1e6 else f"{value / 1e6:.3g}M"
+
+
+def cell(found: Spread | None, unit: str = "") -> str:
+    """median [least … greatest]; "not" where most runs did not come so far."""
+    if found is None:
+        return "–"
+    if not math.isfinite(found.median):
+        return "not" if not math.isfinite(found.least) else f"not [{number(found.least)}{unit} … –]"
+    return f"{number(found.median)}{unit} [{number(found.least)} … {number(found.greatest)}]"
+
+
+def _names(runs: list[Run]) -> list[str]:
+    return list(dict.fromkeys(run["contestant"] for run in runs))
+
+
+def by_seed(runs: list[Run], contestant: str, clock: str, bar: float | None = None) -> dict[int, float]:
+    return {run["seed"]: to_solve(run, clock, bar) for run in runs if run["contestant"] == contestant}
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def race(runs: list[Run], group: str) -> str:
+    """A group whose contestants train until they have solved the task."""
+    name, bar = BARS[group]
+    easier = [EASIER_PENDULUM] if group == "pendulum" else []
+    head = ["", "solved", "steps", "training [s]", "compiling [s]", "total [s]", "training / qrl", "total / qrl"]
+    head += ["training [s] to −160"] * len(easier)
+    rows = []
+    for who in _names(runs):
+        mine = [run for run in runs if run["contestant"] == who]
+        solved = sum(first_at(run, name, bar) is not None for run in mine)
+        row = [who, f"{solved} of {len(mine)}", *(cell(spread(by_seed(runs, who, c).values())) for c in CLOCKS)]
+        for clock in ("train_seconds", "total_seconds"):
+            row.append("" if who == QRL else cell(ratios(by_seed(runs, who, clock), by_seed(runs, QRL, clock)), "×"))
+        row += [cell(spread(by_seed(runs, who, "train_seconds", b).values())) for b in easier]
+        rows.append(row)
+    return _table(head, rows)
+
+
+def commands(runs: list[Run]) -> str:
+    """Whole commands: everything that their last line holds, a row each."""
+    names = list(dict.fromkeys(name for run in runs for name in _last(run)))
+    each = {who: [_last(run) for run in runs if run["contestant"] == who] for who in _names(runs)}
+    rows = [[name.replace("_", " "), *(_of(lines, name) for lines in each.values())] for name in names]
+    return _table(["", *each], rows)
+
+
+def _last(run: Run) -> dict[str, float]:
+    return run["lines"][-1] if run["lines"] else {}
+
+
+def _of(lines: list[dict[str, float]], name: str) -> str:
+    values = [line[name] for line in lines if line.get(name) is not None]
+    return cell(spread(values)) if values else "–"
+
+
+def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
+    """Of the group `speed`: figure -> contestant -> value by seed. How a contestant was told to run ("qrl, one device")
+    is the figure's part.
+    """
+    found: dict[str, dict[str, dict[int, float]]] = {}
+    for run in runs:
+        who, *how = run["contestant"].split(", ")
+        for line in run["lines"]:
+            value = line.get("per_second", line.get("seconds"))
+            figure = ", ".join([line["figure"], *how])
+            found.setdefault(figure, {}).setdefault(who, {})[run["seed"]] = float(value)
+    return found
+
+
+def speed(runs: list[Run]) -> str:
+    """A row for each figure; what others reach is told with our rate over theirs, as we run by ourselves."""
+    found, rows = figures(runs), []
+    for figure, values in found.items():
+        ours = found.get(untold(figure), {}).get(QRL, {})
+        for who, theirs in values.items():
+            ratio = None if who == QRL else ratios(ours, theirs)
+            rows.append([figure, who, cell(spread(theirs.values())), cell(ratio, "×") if ratio else ""])
+    return _table(["", "", "a second, or seconds", "qrl / this"], rows)
+
+
+def untold(figure: str) -> str:
+    """Of whoever was not told how to run."""
+    return figure.removesuffix(ONE_DEVICE).removesuffix(TWO_DEVICES)
+
+
+def derived(runs: list[Run]) -> str:
+    """What a contestant's rates say of each other: devices told over its own choice, and acting's cost by lanes."""
+    found, rows = figures(runs), []
+    for figure, values in found.items():
+        for who, told in values.items():
+            by_itself = found.get(untold(figure), {}).get(who, {})
+            if figure.endswith(TWO_DEVICES):
+                rows.append([f"{figure}, over its own choice", who, cell(ratios(told, by_itself), "×")])
+            elif figure.endswith(ONE_DEVICE):
+                rows.append(
+                    [f"{untold(figure)}, its own choice over one device", who, cell(ratios(by_itself, told), "×")]
+                )
+    acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
+    for who in dict.fromkeys(who for values in acting for who in values):
+        each = [values[who] for values in acting if who in values]
+        seeds = set.intersection(*(set(rates) for rates in each))
+        most, least = ({s: f(rates[s] for rates in each) for s in sorted(seeds)} for f in (max, min))
+        told = f"acting, a step's cost at the dearest of {len(each)} numbers of lanes over the cheapest"
+        rows.append([told, who, cell(ratios(most, least), "×")])
+    return _table(["", "", "ratio"], rows) if rows else ""
+
+
+def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> str:
+    """bench.md."""
+    said = "; ".join(f"{name} {value}" for name, value in machine.items())
+    parts = ["# qrl beside its peers", f"{said}."]
+    if len(commits := sorted({run["commit"] for run in runs if "commit" in run})) > 1:
+        parts.append(f"**Runs of several commits**: {', '.join(commits)}. `--fresh` makes all anew.")
+    parts.append(
+        "Median [least … greatest] over seeds. A ratio is formed of runs made one after the other, seed by seed, and"
+        " then spread likewise. *not*: most runs did not solve it within their budget."
+        " Clocks: experiments/baselines/judge.py."
+    )
+    parts.append(TUNED)
+    for group, title in GROUPS.items():
+        mine = [run for run in runs if run["group"] == group]
+        if mine:
+            made = race(mine, group) if group in BARS else commands(mine) if group == "commands" else speed(mine)
+            parts += [f"## {title}", made]
+            if group == "speed" and (more := derived(mine)):
+                parts.append(more)
+    broken = [run for run in runs if run["outcome"] not in ("done", "out of time")]
+    if absent or broken:
+        told = [f"- {name}: not installed: {why}" for name, why in absent.items()]
+        told += [
+            f"- {r['group']}/{r['contestant']}, seed {r['seed']}: {r['outcome']}: {r.get('said', '')}" for r in broken
+        ]
+        parts += ["## Absent, or failed", "\n".join(told)]
+    return "\n\n".join(parts) + "\n"

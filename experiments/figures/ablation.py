@@ -1,0 +1,139 @@
+"""The paper's objectives side by side, on the pendulum and in hover, as one table: `make ablation`.
+
+    .venv/bin/python -m experiments.figures.ablation [--out experiments/out] [--only pendulum] [--fresh]
+
+Runs `qrl sweep` on experiments/grids/ablation_TASK.json into OUT/ablation/TASK and writes OUT/ablation.md. What
+is finished and current is kept; an interrupted sweep goes on.
+"""
+
+import csv
+import hashlib
+import json
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.arguments import Parser, run_to_the_end
+from experiments.figures import runs as figure_runs
+from experiments.figures.runs import CODE, ROOT, Failed
+from qrl.config import load_preset
+from qrl.runs import files, record
+
+TASKS = ("pendulum", "hover")
+# What each row is. One of a grid that is not here is an error: a table must say what it compares.
+ROWS = {
+    "ours": "the paper's choice: condition 4, (π/μ − 1)·A^π ≥ ε|A^π|, A^π by V-trace, replayed trajectories",
+    "condition 3": "(π − μ)·A^π in the ratio's place; ε|A| is then a margin of densities, not of ratios",
+    "condition 2, V-trace off": "(π/μ − 1)·A^μ: returns of replayed trajectories taken as they are (GAE with λ = 1),"
+    " for the policy's update and the critic's, as if they were the present policy's; so this is V-trace off, too",
+    "condition 1": "(π − μ)·A^μ, from the same uncorrected returns",
+    "constant margin": "ξ in the place of ε|A|, with ξ = ε: A has a root mean square of 1",
+    "on-policy PPO": "condition 2 on the last unroll alone, GAE(0.95)",
+    "V-trace's clips off": "importance ratios as they are, ρ̄ and c̄ = 10⁶",
+    "no symmetries": "ours, without turned and mirrored trajectories (not of the paper)",
+}
+
+
+class Row(NamedTuple):
+    """One objective on one task: the last report of each seed; a seed that diverged is −∞, or 0 of success."""
+
+    returns: np.ndarray  # [seeds]
+    success: np.ndarray  # [seeds], a share
+    diverged: int
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = Parser("ablation", __doc__)
+    parser.add_argument("--out", type=Path, default=Path("experiments/out"), metavar="FOLDER")
+    parser.add_argument("--only", choices=TASKS, help="one task alone")
+    parser.add_argument("--fresh", action="store_true", help="make the sweeps again")
+    args = parser.parse_args(argv)
+    if args.out.exists() and not args.out.is_dir():
+        parser.error(f"--out: {args.out} is a file; expected a folder, or a name for a new one")
+    tasks = [args.only] if args.only else TASKS
+    try:
+        for task in tasks:
+            sweep(grid(task), args.out / "ablation" / task, fresh=args.fresh)
+        found = {task: rows(args.out / "ablation" / task) for task in tasks}
+        files.replace_text(args.out / "ablation.md", page(found))
+    except (OSError, Failed) as error:
+        print(f"ablation: {error}", file=sys.stderr)
+        return 1
+    print(f"{args.out / 'ablation.md'}")
+    return 0
+
+
+def grid(task: str) -> Path:
+    return ROOT / "experiments" / "grids" / f"ablation_{task}.json"
+
+
+def sweep(path: Path, out: Path, *, fresh: bool) -> None:
+    """See to it that `out` holds this grid's sweep, of this code and these versions."""
+    if fresh or not (out / CODE).exists() or (out / CODE).read_text() != stamp(path):
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        (out / CODE).write_text(stamp(path))
+    figure_runs.qrl(["sweep", str(path), "--out", str(out)])
+
+
+def stamp(path: Path) -> str:
+    """What tells whether a sweep of the grid at `path` is current."""
+    versions = {name: version for name, version in record.versions().items() if name not in ("commit", "qrl")}
+    deciding = [json.loads(path.read_text()), versions, figure_runs.sha256()]
+    return hashlib.sha256(json.dumps(deciding, sort_keys=True).encode()).hexdigest()
+
+
+def rows(out: Path) -> dict[str, Row]:
+    """A row for each objective of a sweep's results.csv, in the grid's order."""
+    with (out / "results.csv").open(newline="", encoding="utf-8") as file:
+        lines = list(csv.DictReader(file))
+    found = {}
+    for name in dict.fromkeys(line["objective"] for line in lines):
+        mine = [line for line in lines if line["objective"] == name]
+        sick = [bool(line["diverged"]) for line in mine]
+        returns = [-np.inf if ill else float(line["return_mean"]) for ill, line in zip(sick, mine, strict=True)]
+        success = [0.0 if ill else float(line["success"] or "nan") for ill, line in zip(sick, mine, strict=True)]
+        found[name] = Row(np.array(returns), np.array(success), sum(sick))
+    return found
+
+
+def page(found: dict[str, dict[str, Row]]) -> str:
+    """The table as Markdown; `found`: task -> objective -> row."""
+    names = list(dict.fromkeys(name for table in found.values() for name in table))
+    heads = [f"{task}: {what}" for task in found for what in ("return", "success, %")]
+    lines = ["# The paper's objectives side by side", "", "| objective | " + " | ".join(heads) + " |"]
+    lines.append("|---" * (1 + len(heads)) + "|")
+    for name in names:
+        cells = [cell for table in found.values() for cell in cells_of(table.get(name))]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    lines += ["", *(f"- *{name}*: {ROWS[name]}." for name in names), ""]
+    for task in found:
+        file = json.loads(grid(task).read_text())
+        steps = file["fixed"].get("steps") or load_preset(task)["steps"]
+        lines.append(
+            f"{task}: {steps:,} steps, {file['seeds']} seeds, `qrl sweep experiments/{grid(task).name}`, flown from"
+            " the starts of a run's reports after the last step."
+        )
+    versions = ", ".join(f"{name} {version}" for name, version in record.versions().items())
+    return "\n".join([*lines, "", f"Median [least … most] over seeds. Versions: {versions}.", ""])
+
+
+def cells_of(row: Row | None) -> tuple[str, str]:
+    if row is None:
+        return "–", "–"
+    sick = f"; {row.diverged} of {len(row.returns)} diverged" if row.diverged else ""
+    return spread(row.returns) + sick, spread(100.0 * row.success, ".0f")
+
+
+def spread(values: Any, form: str = ".1f") -> str:
+    """Median [least … most]; a dash where nothing was measured."""
+    if np.isnan(values).any():
+        return "–"
+    return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"
+
+
+if __name__ == "__main__":
+    run_to_the_end("ablation", main)

@@ -1,0 +1,51 @@
+"""Flights of trained policies for the figures: the paper's hovering trial, and circles."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from qrl import tasks
+from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED
+from qrl.runs import record
+from qrl.training import restore
+from qrl.training.state import point, stack
+from qrl.training.trainer import Trainer
+from qrl_envs.perturbations import OffNominal, conditions
+from qrl_envs.task import QuadrotorTask
+
+STARTS = 1000  # those of `make evaluate`; what is drawn are the first of them
+
+
+class Flown(NamedTuple):
+    """Flights of one policy, SI units."""
+
+    seed: int
+    env_steps: int  # after so many of training
+    task: QuadrotorTask
+    observations: np.ndarray  # [n, K + 1, 18] at times 0, dt, … K·dt; NaN from where one ended early
+    measures: dict[str, np.ndarray]  # of measures.py -> [n]
+
+    @property
+    def times_s(self) -> np.ndarray:
+        return np.arange(self.observations.shape[1]) * self.task.control_period_s
+
+
+def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
+    """The last policy of a run's first seed, from the first starts of `make evaluate`.
+
+    With `trial` position and velocity at the start are the paper's trial's; attitude, of which the paper does not tell,
+    and body rates remain the start's own. BadInput or OSError, in a line, where the run cannot be read.
+    """
+    config = tasks.load_run_config(folder)
+    task = tasks.spec(config.task)
+    assert isinstance(task, QuadrotorTask)
+    one = config.member(0)
+    trainer, learner, env_steps = restore.last(tasks.environment(config.task), one, record.members(folder, config)[0])
+    if trial:
+        trainer = Trainer(OffNominal(task, conditions(task)["trial"]), config.learner)
+    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)[:starts]
+    found = trainer.fly(learner, stack([point(trainer.env, config.learner)]), keys)
+    found = jax.tree.map(lambda x: np.asarray(x)[0], found)
+    return Flown(one.seed, env_steps, task, found.observations, found.measures)

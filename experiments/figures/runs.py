@@ -1,0 +1,206 @@
+"""The runs that the figures are drawn from: which there are, whether they are current, and how one is made."""
+
+import ast
+import hashlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from qrl import request, tasks
+from qrl.config import load_preset
+from qrl.runs import files, learning_curve, record
+from qrl.runs.learning_curve import Rows
+from qrl.runs.record import ConfigFile, RunConfig
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOMS = {"qrl": ROOT / "src" / "qrl", "qrl_envs": ROOT / "envs" / "qrl_envs"}
+TRAINING = ("qrl.training.driver", "qrl_envs.env")  # what they import, and they, decide a run's numbers
+CODE = "code.sha256"  # in a run's folder: of which code it is
+
+SEEDS, FAST_SEEDS = 6, 2  # even, so that two cores share them
+PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
+PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
+METHOD = {"apg_fraction": 0.0}  # the paper's method to the end, on trajectories that symmetries turn
+RATIO = PAPER_RATES["high"] / PAPER_RATES["low"]
+
+
+class Failed(RuntimeError):
+    """A run ended with an error; the message says which, in a line."""
+
+
+class Wanted(NamedTuple):
+    """A run that a figure needs; its folder is named so."""
+
+    name: str
+    task: str
+    preset: str  # whose values the flags are laid over
+    flags: dict[str, Any]  # of `qrl train`, by the names of qrl.config
+    seeds: int = 1
+
+    @property
+    def words(self) -> list[str]:
+        """The command, but for its --out."""
+        preset = [] if self.preset == self.task else ["--preset", self.preset]
+        flags = [word for name, value in self.flags.items() for word in (f"--{name.replace('_', '-')}", f"{value}")]
+        return ["train", self.task, "--seeds", str(self.seeds), *preset, *flags]
+
+    def config(self) -> RunConfig:
+        """What its config.json says if it is made now."""
+        file = ConfigFile(learner=tasks.preset(self.preset, self.name))
+        return request.run_config(self.task, None, file, self.flags, 0, self.seeds)
+
+
+def wanted(*, fast: bool) -> list[Wanted]:
+    """All runs, the quickest tasks first."""
+    seeds = FAST_SEEDS if fast else SEEDS
+    found = pendulums("pendulum_fast" if fast else "pendulum", seeds, paper=not fast)
+    if fast:
+        return [
+            *found,
+            Wanted("hover", "hover", "hover_fast", METHOD, seeds),
+            Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 1_200_000}, seeds),
+        ]
+    return [
+        *found,
+        Wanted("hover", "hover", "hover", METHOD | {"steps": 1_500_000, "reports": 25}, seeds),
+        Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 2_400_000, "reports": 20}, seeds),
+        Wanted("hover-flight", "hover", "hover", METHOD | {"steps": 4_500_000}),
+        Wanted("circle-flight", "circle", "circle", METHOD | {"steps": 4_500_000}),
+    ]
+
+
+def pendulums(preset: str, seeds: int, *, paper: bool) -> list[Wanted]:
+    """Both methods at two rates around the recipe's own; with `paper` at the paper's two rates too, held constant."""
+    recipe = {name: load_preset(preset)[name] for name in ("learning_rate", "learning_rate_end")}
+    rates = {"high": recipe, "low": {name: float(f"{value / RATIO:.6g}") for name, value in recipe.items()}}
+    if paper:
+        constant = {name: {"learning_rate": r, "learning_rate_end": r} for name, r in PAPER_RATES.items()}
+        rates |= {f"paper-{name}": rate for name, rate in constant.items()}
+    methods = {"": {}, "-ppo": PPO}
+    return [
+        Wanted(f"pendulum-{rate}{method}", "pendulum", preset, flags | more, seeds)
+        for rate, flags in rates.items()
+        for method, more in methods.items()
+    ]
+
+
+# Whether a run is there
+
+
+def current(folder: Path, run: RunConfig) -> bool:
+    """Whether this very run is there, finished, made by the code and with the versions that are here now."""
+    return (folder / "summary.json").exists() and same(folder, run)
+
+
+def same(folder: Path, run: RunConfig) -> bool:
+    """Whether `folder` holds this very run, finished or not. On which devices and at which commit is no matter."""
+    try:
+        stored = json.loads((folder / "config.json").read_text())
+        code = (folder / CODE).read_text()
+    except (OSError, ValueError):
+        return False
+    return isinstance(stored, dict) and decisive(stored) == decisive(run.model_dump(mode="json")) and code == sha256()
+
+
+def decisive(config: dict[str, Any]) -> dict[str, Any]:
+    """What of a config.json decides a run's numbers."""
+    versions = {name: version for name, version in config.get("versions", {}).items() if name not in ("commit", "qrl")}
+    return {name: config.get(name) for name in ("task", "learner", "seed", "seeds")} | {"versions": versions}
+
+
+def sha256() -> str:
+    """Of all sources that decide what a run's numbers are. A plot may change, and the runs stay."""
+    found = hashlib.sha256()
+    for name, path in sorted(sources().items()):
+        found.update(f"{name}\0".encode() + path.read_bytes() + b"\0")
+    return found.hexdigest()
+
+
+def sources() -> dict[str, Path]:
+    """Module -> file of TRAINING and whatever of our two packages they import."""
+    found: dict[str, Path] = {}
+    ahead = list(TRAINING)
+    while ahead:
+        name = ahead.pop()
+        path = _file(name)
+        if path and name not in found:
+            found[name] = path
+            ahead += _imports(path)
+    return found
+
+
+def _file(name: str) -> Path | None:
+    room, _, rest = name.partition(".")
+    path = ROOMS[room] / f"{rest.replace('.', '/')}.py" if room in ROOMS and rest else None
+    return path if path and path.is_file() else None
+
+
+def _imports(path: Path) -> list[str]:
+    names = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return names
+
+
+# How a run is made
+
+
+def make(one: Wanted, folder: Path) -> float:
+    """Make the run as a user would, in a process of its own; an unfinished one of the same is gone on with.
+
+    Returns its seconds; raises Failed. What else the folder held is removed.
+    """
+    words = [*one.words, "--out", str(folder)]
+    if same(folder, one.config()):
+        words.append("--resume")
+    else:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        (folder / CODE).write_text(sha256())
+    begun = time.perf_counter()
+    qrl(words)
+    return time.perf_counter() - begun
+
+
+def qrl(words: list[str]) -> None:
+    """The command line in a process of its own; Failed if it fails."""
+    command = [sys.executable, "-m", "qrl", *words]
+    # In a session of its own, so that Ctrl-C reaches it once: through us.
+    with subprocess.Popen(command, env=environment(), start_new_session=True) as process:
+        try:
+            code = process.wait()
+        except BaseException:
+            process.terminate()  # it saves, and then ends
+            process.wait()
+            raise
+    if code:
+        raise Failed(f"qrl {' '.join(words)} ended with exit code {code}")
+
+
+def environment() -> dict[str, str]:
+    """Of a run's process: this code's own packages, whatever is installed."""
+    paths = os.pathsep.join([str(ROOT / "src"), str(ROOT / "envs"), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return {**os.environ, "PYTHONPATH": paths}
+
+
+# What a run says
+
+
+def rows(folder: Path) -> list[Rows]:
+    """metrics.csv of each seed."""
+    config = tasks.load_run_config(folder)
+    found = [files.read_metrics(member) for member in record.members(folder, config)]
+    return [[dict(row) for row in one] for one in found]
+
+
+def reports(folder: Path, column: str) -> tuple[Any, Any]:
+    """A column of all seeds' reports: environment steps [x] and values [seeds, x]."""
+    return learning_curve.aligned(rows(folder), column)

@@ -1,0 +1,110 @@
+"""One long run of hover: memory must not grow, nothing be compiled on the way, the return not collapse.
+
+    .venv/bin/python -m experiments.profiling.soak [--steps 2e8] [--hours 1] [--out experiments/out/soak]
+
+Ends at the steps or the hours, whichever comes first, and leaves soak.csv (a row a report) and soak.json (the verdict)
+beside the run folder; exit code 1 if a promise is broken.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from qrl import request, tasks
+from qrl.runs import files, record
+from qrl.training import devices, driver, loop
+
+REPORT_STEPS = 1_000_000
+SETTLED = 0.25  # of the reports: what comes after is held against their end
+MEMORY_GROWTH = 1.02  # of the resident memory then
+RETURN_LOSS = 0.05  # of the best return so far
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=float, default=2e8)
+    parser.add_argument("--hours", type=float, default=1.0)
+    parser.add_argument("--out", type=Path, default=Path("experiments/out/soak"))
+    args = parser.parse_args()
+    reports = max(4, round(args.steps / REPORT_STEPS))
+    long = {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}
+    run = request.run_config("hover", None, record.ConfigFile(), long, 0, 1)
+    devices.use_cores(run, [])
+    if args.out.exists():
+        print(f"{args.out}: exists already; give another --out", file=sys.stderr)
+        return 2
+    (args.out / "run").mkdir(parents=True)
+    began, compiled, rows = time.perf_counter(), [0], []
+
+    def count(event: str, duration_secs: float, **_: str | int) -> None:
+        compiled[0] += event == "/jax/core/compile/backend_compile_duration"
+
+    jax.monitoring.register_event_duration_secs_listener(count)
+
+    def over() -> bool:
+        return time.perf_counter() - began > 3600 * args.hours
+
+    not_finite = ""
+    try:
+        for event in loop.train(tasks.environment(run.task), run, args.out / "run", resume=False, stopped=over):
+            if isinstance(event, loop.Reported):
+                report = {name: event.rows[0][name] for name in ("env_steps", "return_mean", "return_min", "success")}
+                seconds = round(time.perf_counter() - began, 1)
+                rows.append(report | {"seconds": seconds, "memory_MB": memory_MB(), "compilations": compiled[0]})
+                print(rows[-1], flush=True)
+                files.replace_text(args.out / "soak.csv", files.csv_text(rows))
+    except driver.NotFinite as error:
+        not_finite = str(error)
+        print(not_finite, file=sys.stderr)
+    if len(rows) < 4:
+        print(f"too short to judge: {len(rows)} reports", file=sys.stderr)
+        return 1
+    found = verdict(rows)
+    found["finite"] = {"kept": not not_finite, "found": not_finite}
+    ran = {"env_steps": int(rows[-1]["env_steps"]), "seconds": rows[-1]["seconds"], "versions": run.versions}
+    (args.out / "soak.json").write_text(json.dumps({**ran, **found}, indent=2) + "\n")
+    print(json.dumps(found, indent=2))
+    return 0 if all(promise["kept"] for promise in found.values()) else 1
+
+
+def memory_MB() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)
+
+
+def verdict(rows: list[dict[str, float]]) -> dict[str, dict[str, object]]:
+    """Each promise with what it was held against, what was found, and whether it was kept."""
+    memory, compilations, returns = (
+        np.array([row[name] for row in rows]) for name in ("memory_MB", "compilations", "return_mean")
+    )
+    settled = int(len(rows) * SETTLED)
+    drop = float(np.max(np.maximum.accumulate(returns[settled:]) - returns[settled:]))
+    best = float(returns.max())
+    return {
+        "memory_MB": {
+            "settled": float(memory[settled]),
+            "greatest_after": float(memory[settled:].max()),
+            "kept": bool(memory[settled:].max() <= MEMORY_GROWTH * memory[settled]),
+        },
+        "compilations": {
+            "second_report": int(compilations[1]),
+            "last_report": int(compilations[-1]),
+            "kept": bool(compilations[-1] == compilations[1]),
+        },
+        "return": {
+            "best": best,
+            "last": float(returns[-1]),
+            "greatest_drop": drop,
+            "kept": bool(drop <= RETURN_LOSS * abs(best)),
+        },
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

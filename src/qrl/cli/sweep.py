@@ -1,0 +1,220 @@
+"""The command `sweep`: a grid file to a folder of results; the same command goes on with an interrupted one."""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+from rich.progress import BarColumn, Progress, TextColumn
+
+from qrl import tasks
+from qrl.cli.terminal import DONE, FAILED, clock, complain, console, stop_requested
+from qrl.runs import files, record
+from qrl.sweep import grid as grids
+from qrl.sweep import plot, results
+from qrl.sweep import runner as members_of
+from qrl.sweep.grid import Grid
+from qrl.sweep.runner import ChunkDone, Compiling, Group, Member
+from qrl.training import devices, multihost
+from qrl.training.multihost import Process
+from qrl.training.state import point
+from qrl.training.trainer import Trainer
+from qrl_envs.specfile import BadInput, read
+
+SHOWN = 20  # points in the table on the terminal
+POLL_SECONDS = 0.5  # between two looks at what the other processes have finished
+
+
+def sweep(args: argparse.Namespace) -> int:
+    began = time.perf_counter()
+    process = multihost.this_process(args.process_id, args.processes, args.coordinator, os.environ)
+    given = args.memory_gb * 1e9 if args.memory_gb is not None else None
+    grid = grids.load(args.grid, given or devices.host_bytes())  # before the others are waited for
+    multihost.join(process)
+    budget = given or devices.memory_bytes()
+    out: Path = args.out or Path("runs") / args.grid.stem
+    held = _held(out, grid)
+    if held and (out / "summary.json").exists() and (out / "sweep.png").exists():
+        console.print(f"{out}: finished already; nothing to do")
+        return _ending(out)
+    groups = _groups(grid, process, budget, args.grid)
+    out.mkdir(parents=True, exist_ok=True)
+    busy = f"{out}: another sweep is at work in it; wait for its end, or give another OUT"
+    with files.locked(out / f"process-{process.number}.lock", busy):
+        return _work(args, began, process, budget, grid, groups, out)
+
+
+def _work(
+    args: argparse.Namespace,
+    began: float,
+    process: Process,
+    budget: float,
+    grid: Grid,
+    groups: list[Group],
+    out: Path,
+) -> int:
+    """What is done while nobody else may: train what is left, and write what was found."""
+    _prepare(out, grid, process, _held(out, grid))
+    total = len(grid.points) * len(grid.seeds)
+    console.print(
+        f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
+        f" program{'s' * (len(groups) > 1)}, {len(devices.workers())} workers on {jax.local_devices()[0].platform}"
+        f" -> {out}"
+    )
+    with stop_requested("stopping: finished chunks are kept") as stopped:
+        _follow(groups, out, budget, stopped)
+        found = _all_results(out, total, process, stopped)
+    if found is None:
+        console.print("stopped; the same command goes on")
+        return FAILED
+    if process.number:
+        return DONE  # process 0 writes the results
+    return _finish(out, grid, found, args.grid.stem, time.perf_counter() - began)
+
+
+def _held(out: Path, grid: Grid) -> bool:
+    """Whether `out` holds this sweep already; BadInput if it holds something else."""
+    if out.exists() and not out.is_dir():
+        raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
+    if (out / "config.json").exists():
+        raise BadInput(f"{out}: holds a run; give another OUT")
+    path = out / "grid.json"
+    if not path.exists():
+        return False
+    stored = {key: value for key, value in read(path).items() if key not in ("versions", "devices")}
+    if stored != json.loads(json.dumps(grid.record)):
+        raise BadInput(f"{out}: holds a sweep of another grid ({path}); give another OUT")
+    return True
+
+
+def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Group]:
+    """This process's members of every program. Every n-th, whatever is finished: so no two make the same one."""
+    groups = []
+    for indices in grid.groups():
+        first = grid.points[indices[0]]
+        env = tasks.environment(first.task)
+        tasks.check(env, first.learner, f"{path}: at {grids.said(first.place)}")
+        points = {i: point(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
+        members = [
+            Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
+        ]
+        trainer = Trainer(env, first.learner)
+        each, workers = members_of.member_bytes(trainer, members[0].point), len(devices.workers())
+        if not members_of.chunk_members(len(members), each, budget, workers):
+            raise BadInput(
+                f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
+                f" (such as {grids.said(first.place)}) of which one for each worker"
+                f" needs {2 * each * workers / 1e9:.2g} GB"
+            )
+        groups.append(Group(trainer, members[process.number :: process.of]))
+    return groups
+
+
+def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
+    if not held and process.number == 0:
+        here = {"versions": record.versions(), "devices": devices.device_names()}
+        files.write_json(out / "grid.json", {**grid.record, **here})
+
+
+def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
+    """Run every group, and show how far it is: a line a chunk, and a bar in between."""
+    work = sum(len(group.members) * group.steps for group in groups)
+    kept = members_of.finished(
+        out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are made anew")
+    )
+    mine = [group.steps for group in groups for member in group.members if member.number in kept]
+    done = before = sum(mine)
+    count, total = len(mine), sum(len(group.members) for group in groups)
+    began = time.perf_counter()
+
+    def left(now: float) -> str:
+        spent = time.perf_counter() - began
+        return clock(spent / (now - before) * (work - now)) if now > before else "–"
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        shown = bar.add_task("", total=work, completed=done, note="")
+        for number, group in enumerate(groups):
+            under_way: dict[int, int] = {}
+            for event in members_of.run(group, devices.workers(), budget, out / "chunks", stopped):
+                if isinstance(event, Compiling):
+                    console.print(f"compiling program {number + 1} of {len(groups)}, {event.chunk} members at once")
+                elif isinstance(event, ChunkDone):
+                    under_way.pop(event.worker, None)
+                    done += len(event.results) * group.steps
+                    count += len(event.results)
+                    console.print(_line(event, count, total, left(done + sum(under_way.values()))))
+                else:
+                    under_way[event.worker] = event.env_steps
+                    now = done + sum(under_way.values())
+                    bar.update(shown, completed=now, note=f"{count} of {total} members, {left(now)} left")
+
+
+def _line(event: ChunkDone, count: int, total: int, left: str) -> str:
+    sick = sum(bool(result.diverged) for result in event.results.values())
+    return (
+        f"{count:>6} of {total} members done, {clock(event.seconds)} for the last {len(event.results)},"
+        f" {left} left{f'; {sick} diverged' if sick else ''}"
+    )
+
+
+def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
+    """Every member's result, once all processes have made theirs; None if stopped before."""
+    found = members_of.finished(out / "chunks")
+    if len(found) < total and process.of > 1 and not stopped():
+        console.print(f"process {process.number}: waiting for the others")
+    while len(found) < total and process.of > 1 and not stopped():
+        time.sleep(POLL_SECONDS)
+        found = members_of.finished(out / "chunks")
+    return found if len(found) == total else None
+
+
+def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
+    findings = results.findings(grid, found)
+    results.write(out, grid, found, findings, seconds)
+    _print_table(findings, len(grid.seeds))
+    plot.sweep(out / "sweep.png", findings, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
+    code = _ending(out)
+    if code == DONE:
+        console.print(
+            f"done in {clock(seconds)}: {out}/results.csv, summary.json, sweep.png;"
+            f" the best point again: make train CONFIG={out}/best.json OUT=…"
+        )
+    return code
+
+
+def _ending(out: Path) -> int:
+    """The exit code of a finished sweep, the first time and every other."""
+    if (out / "best.json").exists():
+        return DONE
+    complain(f"{out}: every member diverged; results.csv says where")
+    return FAILED
+
+
+def _print_table(findings: list[results.Finding], seeds: int) -> None:
+    """The best points, best first: median and quartiles over seeds."""
+    rows = [
+        [*(_cell(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
+        + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
+        for f in results.ranked(findings)[:SHOWN]
+    ]
+    rows.insert(0, [*findings[0]["at"], "return", "success", "diverged"])
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        console.print("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
+    if len(findings) > SHOWN:
+        console.print(f"… and {len(findings) - SHOWN:,} more in summary.json")
+
+
+def _cell(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _spread(quartiles: dict[str, float], form: str) -> str:
+    if quartiles["median"] != quartiles["median"]:
+        return "–"
+    return f"{quartiles['median']:{form}} [{quartiles['q1']:{form}} … {quartiles['q3']:{form}}]"

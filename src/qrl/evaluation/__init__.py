@@ -1,0 +1,1 @@
+"""A trained run, loaded once for all who fly it."""

@@ -1,0 +1,127 @@
+"""Files of a run folder: atomic writes, CSV and the lock."""
+
+import csv
+import fcntl
+import io
+import json
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from qrl_envs.specfile import BadInput
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write `data` whole or not at all."""
+    replace_text(path, json.dumps(_plain(data), indent=2) + "\n")
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a file under another name and rename it: whoever reads sees the old one or the new one, whole."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # nobody else's, should two write the same file
+    with writing(path):
+        try:
+            with temporary.open("w", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())  # a name that outlives a crash must not point at what did not
+            temporary.replace(path)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """While `path` is written: an OSError's message names it, whatever the system calls it."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def tidy(folder: Path) -> None:
+    """Remove what a killed process left of files that it was writing; for who alone writes in this run folder."""
+    for name in ("config.json", "metrics.csv", "summary.json", "evaluation.json"):
+        for temporary in folder.glob(f"{name}.*.tmp"):
+            temporary.unlink(missing_ok=True)
+
+
+def _plain(data: Any) -> Any:
+    """JSON has no infinities: a number that is not finite becomes null."""
+    if isinstance(data, dict):
+        return {key: _plain(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_plain(value) for value in data]
+    return None if isinstance(data, float) and not math.isfinite(data) else data
+
+
+Row = dict[str, float | int]
+
+
+REPORTED = ("env_steps", "updates", "return_mean", "return_min", "success", "train_seconds")  # by every run
+
+
+def read_metrics(folder: Path) -> list[Row]:
+    """The rows of metrics.csv; an empty cell (not measured) is NaN. OSError, naming the file, if it is damaged."""
+    path = folder / "metrics.csv"
+    if not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *lines = csv.reader(file)
+        rows = [dict(zip(header, map(_number, line), strict=True)) for line in lines]
+        if not set(REPORTED) <= set(header) or not all(
+            math.isfinite(row["env_steps"] + row["train_seconds"]) for row in rows
+        ):
+            raise ValueError("expected the columns of a run's reports")
+    except (ValueError, csv.Error) as error:
+        raise OSError(f"{path}: cannot be read ({str(error)[:120]})") from None
+    return rows
+
+
+def _number(cell: str) -> float | int:
+    number = float(cell or "nan")
+    return int(number) if abs(number) < 2**53 and cell.lstrip("-").isdigit() else number
+
+
+def comparable(value: float) -> float:
+    """For rankings: what was not measured, or is no number, is the worst."""
+    return -math.inf if math.isnan(value) else value
+
+
+def write_metrics(folder: Path, rows: list[Row]) -> None:
+    """Write metrics.csv anew: a few dozen rows, and so it is never half-written. Without a row there is none."""
+    if not rows:
+        (folder / "metrics.csv").unlink(missing_ok=True)
+        return
+    replace_text(folder / "metrics.csv", csv_text(rows))
+
+
+def csv_text(rows: list[dict[str, Any]]) -> str:
+    """Rows as CSV, the same columns in each; NaN (not measured) is an empty cell."""
+    text = io.StringIO()
+    names = dict.fromkeys(name for row in rows for name in row)
+    writer = csv.DictWriter(text, fieldnames=list(names), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(
+        {key: "" if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+        for row in rows
+    )
+    return text.getvalue()
+
+
+@contextmanager
+def locked(path: Path, busy: str) -> Iterator[None]:
+    """Hold the lock file at `path`; BadInput, saying `busy`, if another process does. It goes when its process does."""
+    with path.open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BadInput(busy) from None
+        except OSError:
+            pass  # a file system without locks
+        yield

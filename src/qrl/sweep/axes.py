@@ -1,0 +1,167 @@
+"""The axes of a grid: what a name may be, which values it takes, and how they become settings of a run."""
+
+import json
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from qrl.algorithm.learner import Terms
+from qrl.config import Config
+from qrl.runs.record import TaskRecord
+from qrl_envs import specfile
+from qrl_envs.specfile import BadInput, Count, Real, Spec
+
+DIGITS = 6  # to which the values of a range are rounded: enough to tell them apart, few enough to read
+# What a table of results calls its own columns; and whatever begins so.
+COLUMNS = (
+    *("point", "seed", "seeds", "diverged", "env_steps", "updates", "return_mean", "return_min", "success"),
+    *("train_seconds", "steps_per_second", "reward_mean", "ended_early", *Terms._fields),
+)
+MEASURES = ("settle_", "rms_")
+JUDGED = "task.evaluation"  # the same for all points, else they could not be compared
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Values of one setting, or named settings of several."""
+
+    values: tuple[Any, ...]  # of the setting; of named settings the names
+    named: dict[str, dict[str, Any]] | None = None
+
+    def settings(self, name: str, value: Any) -> dict[str, Any]:
+        return self.named[value] if self.named is not None else {name: value}
+
+    def names(self, name: str) -> list[str]:
+        """The settings that this axis sets."""
+        return list(dict.fromkeys(key for s in self.named.values() for key in s)) if self.named is not None else [name]
+
+    @property
+    def size(self) -> int:
+        return len(self.values)
+
+    def draw(self, rng: np.random.Generator) -> Any:
+        return self.values[rng.integers(len(self.values))]
+
+
+class Range(Spec):
+    """Numbers between two, evenly spaced or so in their logarithm; `count` of them, or drawn at random."""
+
+    from_: Real = Field(alias="from")
+    to: Real
+    count: Count | None = None
+    spacing: Literal["lin", "log"] = "lin"
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Range":
+        if not self.from_ < self.to:
+            raise ValueError(f"expected from < to, found {self.from_} and {self.to}")
+        if self.spacing == "log" and self.from_ <= 0:
+            raise ValueError(f"expected from > 0 with log spacing, found {self.from_}")
+        return self
+
+    def settings(self, name: str, value: Any) -> dict[str, Any]:
+        return {name: value}
+
+    def names(self, name: str) -> list[str]:
+        return [name]
+
+    @property
+    def size(self) -> int:
+        return self.count or 1
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Made when asked for: of two thousand million only the number is looked at."""
+        return tuple(self.at(i / (self.size - 1)) for i in range(self.size))
+
+    def at(self, share: float) -> float:
+        """The number a fraction `share` of the way from `from` to `to`."""
+        if self.spacing == "log":
+            value = math.exp(math.log(self.from_) + share * (math.log(self.to) - math.log(self.from_)))
+        else:
+            value = self.from_ + share * (self.to - self.from_)
+        return float(f"{value:.{DIGITS}g}")
+
+    def draw(self, rng: np.random.Generator) -> float:
+        return self.at(rng.random())
+
+
+def settable(task: TaskRecord) -> list[str]:
+    """Every setting that a grid may name: hyperparameters, and paths into the task's own record."""
+    paths = [path for path in _paths(task.spec or {}, "task") if path != "task.description"]
+    return [*Config.model_fields, *(path for path in paths if not path.startswith(JUDGED))]
+
+
+def _paths(value: Any, path: str) -> Iterable[str]:
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _paths(inner, f"{path}.{key}")
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for index in ("*", *range(len(value))):
+            yield from _paths(value[0], f"{path}.{index}")
+    else:
+        yield path
+
+
+def put(spec: Any, path: list[str], value: Any) -> Any:
+    """A copy of the JSON value `spec` with `value` at `path`; "*" is every element of a list."""
+    if not path:
+        return value
+    first, *rest = path
+    if isinstance(spec, list):
+        return [put(inner, rest, value) if first in ("*", str(i)) else inner for i, inner in enumerate(spec)]
+    return {**spec, first: put(spec[first], rest, value)}
+
+
+def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) -> Axis | Range:
+    """One axis as the grid file writes it: a list, a range, or an object of named settings."""
+    key = f"{where}: key 'axes.{name}'"
+    if value in ([], {}):
+        raise BadInput(f"{key}: expected at least one value, found none")
+    if isinstance(value, list):
+        return Axis(tuple(value))
+    if not isinstance(value, dict):
+        raise BadInput(f"{key}: expected a list of values, a range or named settings, found {json.dumps(value)[:57]}")
+    if all(isinstance(inner, dict) for inner in value.values()):
+        if name in known:
+            raise BadInput(f"{key}: expected another name for named settings than that of a setting")
+        _refuse_title(name, value, key)
+        return Axis(tuple(value), value)
+    span = specfile.build(Range, value, f"{where}: axes.{name}")
+    if (span.count is None) != sampled:
+        expected = "no count where points are sampled" if sampled else "a count, or else 'sample'"
+        raise BadInput(f"{key}: expected {expected}, found {json.dumps(value)}")
+    if span.count == 1:
+        raise BadInput(f"{key}: expected a range of at least 2 values, found count 1")
+    return span
+
+
+def _refuse_title(name: str, settings: dict[str, Any], key: str) -> None:
+    if not name or "" in settings:
+        raise BadInput(f'{key}: expected a name for {"each of its settings" if name else "the axis"}, found ""')
+    if name in COLUMNS or name.startswith(MEASURES):
+        raise BadInput(f"{key}: expected another name than that of a column of results.csv, found '{name}'")
+
+
+def refuse_clashes(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:
+    """BadInput if a name is unknown, or set from two sides."""
+    setters = dict.fromkeys(fixed, "fixed")
+    for name in fixed:
+        _refuse_unknown(name, known, f"{where}: fixed")
+    for title, values in axes.items():
+        for name in values.names(title):
+            _refuse_unknown(name, known, f"{where}: axes")
+            if name in setters:
+                raise BadInput(f"{where}: key 'axes.{title}': '{name}' is set in '{setters[name]}' too")
+            setters[name] = f"axes.{title}"
+
+
+def _refuse_unknown(name: str, known: list[str], where: str) -> None:
+    if name.startswith(JUDGED):
+        raise BadInput(f"{where}: key '{name}': how a task is judged is the same for all points of a grid")
+    if name not in known:
+        raise BadInput(f"{where}: unknown key '{name}'{specfile.nearest(name, known)}")

@@ -1,0 +1,128 @@
+"""What a sweep found: a table, medians and quartiles over seeds, the best point, and a run that repeats it."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from qrl.runs import files, record
+from qrl.runs.files import comparable
+from qrl.runs.record import RunConfig
+from qrl.sweep.grid import Grid
+from qrl.sweep.runner import Result
+from qrl.training import devices
+
+CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
+Finding = dict[str, Any]  # of one point: place, seeds, how many diverged, quartiles of each number of the last report
+
+
+def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
+    """A row for each point and seed: the point's place, the seed, and its last report."""
+    return [
+        {**_label(grid, index), "diverged": result.diverged, **result.rows[-1]}
+        for index, result in sorted(results.items())
+    ]
+
+
+def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
+    """Every report of every point and seed."""
+    return [
+        {**_label(grid, index), **{name: row[name] for name in CURVE}}
+        for index, result in sorted(results.items())
+        for row in result.rows
+    ]
+
+
+def _label(grid: Grid, index: int) -> dict[str, Any]:
+    point, seed = divmod(index, len(grid.seeds))
+    place = {name: _cell(value) for name, value in grid.points[point].place.items()}
+    return {"point": point, **place, "seed": grid.seeds[seed]}
+
+
+def _cell(value: Any) -> Any:
+    return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
+
+
+def findings(grid: Grid, results: dict[int, Result]) -> list[Finding]:
+    """For each point the quartiles over its seeds; a seed that diverged counts as the worst there could be."""
+    measured = any(math.isfinite(row["success"]) for result in results.values() for row in result.rows[-1:])
+    found = []
+    for i, point in enumerate(grid.points):
+        seeds = [results[i * len(grid.seeds) + j] for j in range(len(grid.seeds))]
+        numbers = {
+            name: _quartiles([_worst(name, measured) if seed.diverged else seed.rows[-1][name] for seed in seeds])
+            for name in seeds[0].rows[-1]
+            if name not in ("env_steps", "updates")
+        }
+        sick = sum(bool(seed.diverged) for seed in seeds)
+        found.append({"point": i, "at": point.place, "seeds": len(seeds), "diverged": sick, **numbers})
+    return found
+
+
+def _worst(name: str, measured: bool) -> float:
+    if name.startswith(("settle_", "rms_")):
+        return math.inf
+    return {"success": 0.0 if measured else math.nan, "return_mean": -math.inf, "return_min": -math.inf}.get(
+        name, math.nan
+    )
+
+
+def _quartiles(values: list[float]) -> dict[str, float]:
+    ordered = np.sort(np.asarray(values, np.float64))  # NaN last
+    return {name: _quantile(ordered, share) for name, share in (("median", 0.5), ("q1", 0.25), ("q3", 0.75))}
+
+
+def _quantile(ordered: Any, share: float) -> float:
+    """As NumPy has it, but of infinities too: between an infinity and a number lies that infinity."""
+    if np.isfinite(ordered).all() or np.isnan(ordered[-1]):
+        return float(np.quantile(ordered, share))
+    place = share * (len(ordered) - 1)
+    low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
+    if low == high:  # one place, or the same infinity
+        return low
+    fraction = place - math.floor(place)
+    return low * (1 - fraction) + high * fraction
+
+
+def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | None:
+    """The point of the highest median success and, among equals, median return; None if all diverged."""
+    alive = [finding for finding in found if finding["diverged"] < seeds]
+    return max(alive, key=_rank)["point"] if alive else None
+
+
+def _rank(finding: Finding) -> tuple[bool, float, float]:
+    alive = finding["diverged"] < finding["seeds"]
+    return alive, comparable(finding["success"]["median"]), comparable(finding["return_mean"]["median"])
+
+
+def ranked(found: list[Finding]) -> list[Finding]:
+    """Best first."""
+    return sorted(found, key=_rank, reverse=True)
+
+
+def repeat(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
+    """The run of a point with its middle seed: the lower median, of those that did not diverge."""
+    first = point * len(grid.seeds)
+    last = {j: results[first + j].rows[-1] for j in range(len(grid.seeds)) if not results[first + j].diverged}
+    order = sorted(last, key=lambda j: (comparable(last[j]["success"]), comparable(last[j]["return_mean"])))
+    return RunConfig(
+        task=grid.points[point].task,
+        learner=grid.points[point].learner,
+        seed=grid.seeds[order[(len(order) - 1) // 2]],
+        seeds=1,
+        versions=record.versions(),
+        devices=sorted({str(device) for device in devices.workers()}),
+    )
+
+
+def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Finding], seconds: float) -> None:
+    """results.csv, curves.csv, best.json and, last, summary.json."""
+    files.replace_text(out / "results.csv", files.csv_text(table(grid, results)))
+    files.replace_text(out / "curves.csv", files.csv_text(curves(grid, results)))
+    winner = best(found, results, len(grid.seeds))
+    if winner is not None:
+        files.write_json(out / "best.json", repeat(grid, results, winner).model_dump(mode="json"))
+    summary = {"best": winner, "programs": len(grid.groups()), "points": found, "command_seconds": round(seconds, 1)}
+    files.write_json(out / "summary.json", summary)

@@ -1,0 +1,260 @@
+"""Many members through one compiled program: in chunks that fit into memory, each recorded whole once it is done.
+
+A finished chunk is a file in the sweep's folder, written under another name and then renamed; whoever goes on with an
+interrupted sweep, on however many devices or hosts, makes only the members that no file holds.
+"""
+
+import json
+import math
+import threading
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Queue
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import SingleDeviceSharding
+
+from qrl.runs.files import Row, replace_text
+from qrl.training import driver
+from qrl.training.state import Point, stack
+from qrl.training.trainer import Trainer
+
+# A CPU takes the members of a chunk one after the other: more gain no speed, and are what an interruption loses.
+CPU_CHUNK = 8
+
+
+class Member(NamedTuple):
+    """One point with one seed."""
+
+    number: int  # in the whole sweep: point · seeds + seed's place
+    seed: int
+    point: Point
+
+
+@dataclass(frozen=True)
+class Group:
+    """Members that share one compiled program."""
+
+    trainer: Trainer
+    members: list[Member]
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of one member."""
+        config = self.trainer.config
+        return config.unrolls * config.unroll_size
+
+
+class Result(NamedTuple):
+    """What is kept of a member."""
+
+    rows: list[Row]  # as in metrics.csv; `train_seconds` is its share of the chunk's
+    diverged: str  # what was first not finite, and when; "": nothing
+
+
+@dataclass(frozen=True)
+class Compiling:
+    """About to compile a group's programs for so many members at once."""
+
+    group: Group
+    chunk: int
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A sign of life: a worker's chunk has come this far."""
+
+    group: Group
+    worker: int
+    env_steps: int  # of all its members
+
+
+@dataclass(frozen=True)
+class ChunkDone:
+    """A chunk is recorded."""
+
+    group: Group
+    worker: int
+    results: dict[int, Result]
+    seconds: float
+
+
+def member_bytes(trainer: Trainer, point: Point) -> int:
+    """What a member needs: its state, once more where the program writes it, and its flights."""
+    seeds, points = _like([Member(0, 0, point)], 1, None)
+    states = jax.eval_shape(trainer.init, seeds, points)
+    flights = jax.eval_shape(trainer.fly, states.learner, points, driver.report_starts(trainer.config))
+    return 2 * _bytes(states) + _bytes(flights)
+
+
+def _bytes(tree: Any) -> int:
+    return sum(math.prod(leaf.shape) * leaf.dtype.itemsize for leaf in jax.tree.leaves(tree))
+
+
+def chunk_members(members: int, each_bytes: int, budget_bytes: float, workers: int) -> int:
+    """Members of one chunk, so that every worker has one in memory, and chunks are even; 0: not even one fits.
+
+    A program needs room for its members and, as scratch, for about one more.
+    """
+    most = int(budget_bytes // (each_bytes * workers)) - 1
+    if jax.default_backend() == "cpu":
+        most = min(most, CPU_CHUNK)
+    if most < 1:
+        return 0
+    rounds = math.ceil(members / (most * workers))
+    return math.ceil(members / (rounds * workers))
+
+
+def run(
+    group: Group, devices: Sequence[Any], budget_bytes: float, folder: Path, stopped: Callable[[], bool]
+) -> Iterator[Compiling | Progress | ChunkDone]:
+    """Train the members of a group that have no result yet, a worker for each of `devices`, until `stopped()`.
+
+    A device may be named several times: a CPU runs a program on about one core, and takes several at a time.
+    """
+    done = finished(folder)
+    left = [member for member in group.members if member.number not in done]
+    if not left or stopped():
+        return
+    size = chunk_members(len(left), member_bytes(group.trainer, left[0].point), budget_bytes, len(devices))
+    folder.mkdir(parents=True, exist_ok=True)
+    yield Compiling(group, size)
+    programs = {device: _compiled(group.trainer, left, size, device) for device in set(devices)}
+    chunks = deque(left[i : i + size] for i in range(0, len(left), size))
+    events: Queue[Any] = Queue()
+    halt = threading.Event()
+
+    def work(worker: int, device: Any) -> None:
+        try:
+            while not halt.is_set() and (members := _next(chunks)):
+                for event in _chunk(group, programs[device], members, size, device, folder, halt.is_set):
+                    events.put(event(worker))
+            events.put(None)
+        except BaseException as error:
+            events.put(error)
+
+    threads = [threading.Thread(target=work, args=pair, daemon=True) for pair in enumerate(devices)]
+    for thread in threads:
+        thread.start()
+    working = len(devices)
+    try:
+        while working:
+            event = events.get()
+            if isinstance(event, BaseException):
+                raise event
+            if stopped():
+                halt.set()
+            if event is None:
+                working -= 1
+            else:
+                yield event
+    finally:
+        halt.set()
+        for thread in threads:  # to the end of its lap: Python must not end while it is inside XLA
+            thread.join()
+
+
+def _next(chunks: deque[list[Member]]) -> list[Member]:
+    """A chunk for whoever asks first; none left: empty."""
+    with suppress(IndexError):
+        return chunks.popleft()
+    return []
+
+
+def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
+    """Shapes and types of the seeds and points of a chunk."""
+    sharding = SingleDeviceSharding(device) if device else None
+    points = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype, sharding=sharding), members[0].point
+    )
+    return jax.ShapeDtypeStruct((size,), np.int32, sharding=sharding), points
+
+
+def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, driver.Programs]:
+    """The first state's program and the others, for chunks of `size` members."""
+    seeds, points = _like(members, size, device)
+    states = jax.tree.map(
+        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
+        jax.eval_shape(trainer.init, seeds, points),
+    )
+    advance, climb, fly = (
+        compiled(trainer, states, points)
+        for compiled in (driver.compile_advance, driver.compile_climb, driver.compile_fly)
+    )
+    return trainer.init.lower(seeds, points).compile(), driver.Programs(advance, lambda: climb, fly, trainer.on_host)
+
+
+def _chunk(
+    group: Group,
+    programs: tuple[Any, driver.Programs],
+    members: list[Member],
+    size: int,
+    device: Any,
+    folder: Path,
+    halted: Callable[[], bool],
+) -> Iterator[Callable[[int], Progress | ChunkDone]]:
+    """Train a chunk and record it, unless `halted()` on the way; yields events that lack their worker."""
+    began = time.perf_counter()
+    padded = members + [members[-1]] * (size - len(members))  # one program, one number of members
+    points = jax.device_put(stack([member.point for member in padded]), device)
+    seeds = jax.device_put(np.asarray([member.seed for member in padded], np.int32), device)
+    states = programs[0](seeds, points)
+    rows: list[list[Row]] = [[] for _ in members]
+    faults: list[str] = []
+    for lap in driver.laps(states, points, programs[1], group.trainer.config, driver.Clock(), halted):
+        faults, env_steps = lap.faults, lap.env_steps * len(members)
+        for kept, row in zip(rows, lap.rows, strict=False):  # what fills the chunk up is not kept
+            share = {"train_seconds": round(row["train_seconds"] / len(members), 3)}
+            kept.append({key: value for key, value in (row | share).items() if key != "steps_per_second"})
+        yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
+    if all(kept and kept[-1]["env_steps"] == group.steps for kept in rows):
+        results = {member.number: Result(rows[i], faults[i]) for i, member in enumerate(members)}
+        replace_text(folder / f"{members[0].number:07d}.json", json.dumps(record(results)) + "\n")
+        seconds = time.perf_counter() - began
+        yield lambda worker: ChunkDone(group, worker, results, seconds)
+
+
+def record(results: dict[int, Result]) -> dict[str, Any]:
+    """What a chunk's file holds. Numbers that are not finite as text: JSON has none."""
+    members = {
+        str(i): {
+            "rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows],
+            "diverged": why,
+        }
+        for i, (rows, why) in results.items()
+    }
+    return {"members": members, "crc32": _sum(members)}
+
+
+def _sum(members: Any) -> int:
+    """By which a damaged chunk is known, whatever the damage."""
+    return zlib.crc32(json.dumps(members).encode())
+
+
+def finished(folder: Path, unreadable: Callable[[Path], None] = lambda path: None) -> dict[int, Result]:
+    """The results in a sweep's folder of chunks, by member. What cannot be read is as if it had not been made."""
+    results = {}
+    for path in sorted(folder.glob("*.json")):
+        try:
+            results |= _recorded(path)
+        except (OSError, ValueError, LookupError, TypeError, RecursionError):
+            unreadable(path)
+    return results
+
+
+def _recorded(path: Path) -> dict[int, Result]:
+    data = json.loads(path.read_text(encoding="utf-8"))
+    if data["crc32"] != _sum(data["members"]):
+        raise ValueError("damaged")
+    found = {}
+    for index, kept in data["members"].items():
+        rows = [{k: float(v) if isinstance(v, str) else v for k, v in row.items()} for row in kept["rows"]]
+        found[int(index)] = Result(rows, kept["diverged"])
+    return found

@@ -1,0 +1,141 @@
+"""From a task's name or file to an environment that can be trained: where learner and worlds meet."""
+
+import contextlib
+import io
+import os
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import jax
+
+from qrl.algorithm.types import Env
+from qrl.config import Config, load_preset, preset_names
+from qrl.runs.record import RunConfig, TaskRecord
+from qrl_envs import env as worlds
+from qrl_envs import specfile
+from qrl_envs import task as task_spec
+from qrl_envs.specfile import BadInput
+
+
+def _brax_envs() -> ModuleType:
+    """`brax.envs`: over a second to import, and wanted for its own environments alone."""
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints which optional packages it does not find
+        from brax import envs
+
+    return envs
+
+
+def foreign_tasks() -> list[str]:
+    """Brax's own environments, which can be trained by name too."""
+    return sorted(set(_brax_envs()._envs) - set(task_spec.shipped()))  # Brax offers no public list
+
+
+def task_record(name: str) -> TaskRecord:
+    """The task of a shipped name, a `.json` path or one of Brax's names."""
+    if name not in task_spec.shipped() and not name.endswith(".json"):
+        if name in foreign_tasks():
+            return TaskRecord(name=name, spec=None)
+        raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*task_spec.shipped(), *foreign_tasks()])}")
+    spec = task_spec.load(name).model_dump(mode="json", exclude_none=True)
+    return TaskRecord(name=_folder(Path(name).stem, name), spec=spec)
+
+
+def task_named(name: str, path: Path) -> TaskRecord:
+    """The task that the file at `path` names."""
+    try:
+        return task_record(name)
+    except BadInput as error:
+        raise BadInput(f"{path}: key 'task': {error}") from None
+
+
+def _folder(name: str, where: str) -> str:
+    """A task's name, which its run's folder bears too."""
+    if not name.strip(".") or set("/\0") & set(name) or len(os.fsencode(name)) > 255:
+        raise BadInput(f"{where}: expected a task whose name can be a folder's, found '{name}'")
+    return name
+
+
+def environment(record: TaskRecord) -> Env:
+    """The Brax environment of a recorded task."""
+    if record.spec is None:
+        return _brax_envs().get_environment(record.name)
+    return worlds.from_task(spec(record))
+
+
+def spec(record: TaskRecord) -> task_spec.Task:
+    """The task of a record of one of our own worlds."""
+    assert record.spec is not None
+    return task_spec.from_data(record.spec, record.name)
+
+
+def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
+    if record.spec is not None:
+        spec = task_spec.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
+        return TaskRecord(name=_folder(record.name, f"{where}: key 'task.name'"), spec=spec)
+    if record.name not in foreign_tasks():
+        raise BadInput(f"{where}: key 'task.name': unknown task '{record.name}'")
+    return record
+
+
+def preset(name: str, where: str) -> dict[str, Any]:
+    """The preset of that name, which `where` names: all of the learner's values."""
+    if name not in preset_names():
+        raise BadInput(f"{where}: no preset '{name}'{specfile.nearest(name, preset_names())}")
+    return load_preset(name)
+
+
+def task_preset(record: TaskRecord, where: str) -> dict[str, Any]:
+    """The learner's defaults for a task, which `where` names."""
+    return preset(record.spec["preset"] if record.spec else "default", f"{where}: the task's key 'preset'")
+
+
+def check(env: Env, learner: Config, where: str) -> None:
+    """Whether the learner can train on this environment at all; `where` is who asks for it."""
+    size = env.observation_size
+    if not isinstance(size, int):
+        raise BadInput(
+            f"{where}: this environment's observation is not one flat vector, which is all that qrl trains on"
+        )
+    given = len(learner.observation_scale or ())
+    if given not in (0, size):
+        raise BadInput(
+            f"{where}: key 'observation_scale': expected {size} numbers, one for each observation, found {given}"
+        )
+    try:
+        state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
+        jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
+    except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
+        raise BadInput(f"{where}: this environment does not work with jax {jax.__version__}: {error}") from None
+    if learner.climbs and not hasattr(env, "evaluation"):  # ours are differentiable
+        try:
+            jax.eval_shape(
+                jax.grad(lambda action: env.step(env.reset(jax.random.PRNGKey(0)), action).reward.sum()),
+                jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32),
+            )
+        except Exception as error:
+            raise BadInput(
+                f"{where}: key 'apg_fraction': expected 0, for this environment cannot be differentiated: {error}"
+            ) from None
+
+
+MOST_SEEDS = 10_000  # of one program
+
+
+def check_seed_range(run: RunConfig, where: str) -> RunConfig:
+    """`run`, if each of its seeds can have its folder, and its number in the program."""
+    if run.seeds > MOST_SEEDS or run.seed + run.seeds > 2**31:
+        raise BadInput(
+            f"{where}: expected at most {MOST_SEEDS:,} seeds, all of them below {2**31:,},"
+            f" found {run.seeds:,} from {run.seed:,}"
+        )
+    return run
+
+
+def load_run_config(folder: Path) -> RunConfig:
+    """The config.json of a run folder."""
+    path = folder / "config.json"
+    if not path.exists():
+        raise BadInput(f"{folder}: not a run folder (no config.json)")
+    run = specfile.build(RunConfig, specfile.read(path), str(path))
+    return check_seed_range(run.model_copy(update={"task": check_task_record(run.task, str(path))}), str(path))

@@ -1,0 +1,1 @@
+"""One run: compiled programs, devices, and the loop on the host."""

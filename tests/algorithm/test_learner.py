@@ -1,0 +1,278 @@
+"""The update: what it minimises, and what its options mean."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qrl.algorithm.learner import Hyper, Learner, LearnerState, Terms, hyper
+from qrl.algorithm.networks import log_density
+from qrl.algorithm.types import Transition
+from qrl.algorithm.vtrace import vtrace
+from qrl.config import TRACED, Config, load_preset
+
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
+B, T, F, A = 3, 7, 5, 2
+
+
+def config(**changes: object) -> Config:
+    return Config.model_validate(load_preset("default") | {"normalise_observations": False} | changes, strict=False)
+
+
+def random_ends() -> np.ndarray:
+    return np.random.default_rng(0).random((B, T)) < 0.4  # more than one in a trajectory
+
+
+def ends_at(*steps: int) -> np.ndarray:
+    """[B, T]: trajectory i ends at the i-th of `steps`; T: not at all."""
+    return np.arange(T) == np.asarray(steps)[:, None]
+
+
+# Where trajectories end: at more steps than one (V of all that follows is computed anew) or at fewer.
+ENDS = {
+    "ends within": random_ends(),
+    "one end within": ends_at(0, T - 2, 3),
+    "one end within, one at the end": ends_at(2, T, 4) | ends_at(T - 1, T - 1, T),
+    "ends at the end": ends_at(T, T - 1, T - 1),
+}
+
+
+def batch(seed: int = 0, ended: np.ndarray = ENDS["ends within"]) -> Transition:
+    """Trajectories: what follows a step is what precedes the next one, but at an end."""
+    rng = np.random.default_rng(seed)
+    count, steps = ended.shape
+    terminated = ended & (np.cumsum(ended).reshape(ended.shape) % 3 == 0)
+    truncated = ended & ~terminated
+    observation = rng.normal(size=(count, steps + 1, F))
+    values = Transition(
+        observation=observation[:, :-1],
+        action=rng.normal(size=(count, steps, A)),
+        log_mu=rng.normal(size=ended.shape) - 2.0,
+        reward=rng.normal(size=ended.shape),
+        next_observation=np.where(ended[..., None], rng.normal(size=(count, steps, F)), observation[:, 1:]),
+        terminated=terminated,
+        truncated=truncated,
+        out_of_bounds=truncated & (np.cumsum(truncated) % 3 == 2).reshape(ended.shape),
+    )
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
+
+
+def losses(learner: Learner, data: Transition) -> tuple[float, float]:
+    _, terms = jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)
+    return float(terms.policy_loss), float(terms.value_loss)
+
+
+def mlp(params: dict, x: np.ndarray) -> np.ndarray:
+    layers = [params["params"][f"Dense_{i}"] for i in range(len(params["params"]))]
+    for i, layer in enumerate(layers):
+        x = x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
+        x = np.maximum(x, 0.0) if i < len(layers) - 1 else x
+    return x
+
+
+def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tuple[float, float]:
+    """Algorithm 1 and the paper's two losses for one minibatch, sample by sample in float64."""
+    c, state = learner.config, learner.init(jax.random.PRNGKey(1))
+    scale = np.asarray(c.observation_scale or (1.0,) * F)
+    d = jax.tree.map(lambda x: np.asarray(x, np.float64), data)
+    v = mlp(state.params.critic, d.observation * scale)[..., 0]
+    v_next = mlp(state.params.critic, d.next_observation * scale)[..., 0]
+    mean = mlp(state.params.policy, d.observation * scale)
+    log_pi = (-0.5 * ((d.action - mean) / c.sigma) ** 2 - np.log(c.sigma) - 0.5 * np.log(2 * np.pi)).sum(-1)
+    ratio = np.exp(log_pi - d.log_mu)
+    a_trace, v_trace = np.zeros(d.reward.shape), np.zeros(d.reward.shape)
+    for b in range(len(d.reward)):
+        carried = 0.0
+        for i in reversed(range(d.reward.shape[1])):
+            carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
+            for_ever = c.reward_scale * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
+            after = for_ever if d.out_of_bounds[b, i] else v_next[b, i]
+            bootstrap = 0.0 if d.terminated[b, i] else after
+            a_trace[b, i] = c.reward_scale * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
+            carried = (min(1.0, ratio[b, i]) if off_policy else 1.0) * a_trace[b, i]
+            v_trace[b, i] = v[b, i] + carried
+    a = a_trace / np.sqrt((a_trace**2).mean()) if c.normalise_advantage else a_trace
+    gain = (ratio - 1.0) * a if c.form == "ratio" else (np.exp(log_pi) - np.exp(d.log_mu)) * a
+    limit = c.epsilon * np.abs(a) if c.xi is None else c.xi
+    return -np.minimum(gain, limit).mean(), ((v - v_trace) ** 2).mean()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"normalise_advantage": False, "observation_scale": [1.0, 0.5, 2.0, 1.0, 1.0]},
+        {"form": "difference", "xi": 0.01},
+        {"advantage": "mu", "form": "difference"},
+        {"advantage": "mu", "lam": 0.9},
+    ],
+    ids=["paper", "scaled", "condition 3, constant margin", "condition 1", "condition 2: PPO with GAE"],
+)
+@pytest.mark.parametrize("ended", ENDS.values(), ids=ENDS)
+def test_losses_are_the_papers(changes: dict, ended: np.ndarray) -> None:
+    """L_policy and L_value of Sec. 4 and Algorithm 1, against a literal loop, for each condition."""
+    learner, data = Learner(config(**changes), F, A), batch(ended=ended)
+    expected = literal_losses(learner, data, off_policy=learner.config.advantage == "pi")
+    np.testing.assert_allclose(losses(learner, data), expected, rtol=2e-4)
+
+
+@pytest.mark.parametrize("steps", [1, 2])
+def test_unrolls_may_be_short(steps: int) -> None:
+    """Of one step there is none within; of two, one."""
+    learner, data = Learner(config(), F, A), batch(ended=ENDS["one end within"][:, :steps])
+    np.testing.assert_allclose(losses(learner, data), literal_losses(learner, data, off_policy=True), rtol=2e-4)
+
+
+def test_members_side_by_side_have_their_own_ends() -> None:
+    """Under vmap, as on a GPU, a member whose V is computed anew throughout changes no other."""
+    learner = Learner(config(), F, A)
+    each = [batch(0, ENDS["ends within"]), batch(1, ENDS["one end within"])]
+    state = learner.init(jax.random.PRNGKey(1))
+    both = jax.tree.map(lambda *x: jnp.stack(x), *each)
+    _, terms = jax.jit(jax.vmap(learner.update, in_axes=(None, 0)))(state, both)
+    for i, data in enumerate(each):
+        np.testing.assert_allclose((terms.policy_loss[i], terms.value_loss[i]), losses(learner, data), rtol=1e-5)
+
+
+def test_update_ascends_both_losses() -> None:
+    """Repeated updates on one batch lower the value loss and raise the objective."""
+    learner = Learner(config(learning_rate=1e-2, steps=1_000_000), F, A)
+    data, update = batch(), jax.jit(learner.update)
+    state, first = update(learner.init(jax.random.PRNGKey(1)), data)
+    last = first
+    for _ in range(30):
+        state, last = update(state, data)
+    assert last.policy_loss < first.policy_loss
+    assert last.value_loss < first.value_loss
+
+
+def test_normalised_the_policy_gradient_is_divided_by_the_deviation_of_a() -> None:
+    """The objective with xi = epsilon·|A| is proportional to A; the critic's is not concerned."""
+    data = batch()
+    data = data._replace(reward=5.0 * data.reward)
+    plain, normal = (
+        jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)[1]
+        for learner in (Learner(config(normalise_advantage=on), F, A) for on in (False, True))
+    )
+    assert plain.a_trace > 2.0
+    np.testing.assert_allclose(normal.policy_gradient, plain.policy_gradient / plain.a_trace, rtol=1e-5)
+    np.testing.assert_allclose(normal.value_gradient, plain.value_gradient, rtol=1e-5)
+
+
+@pytest.mark.parametrize("xi", [None, 0.3])
+def test_a_minibatch_in_parts_is_the_whole(xi: float | None) -> None:
+    """A trajectory on each of three devices: A is normalised by its deviation over all."""
+    data = batch()
+    data = data._replace(reward=data.reward * jnp.array([0.2, 1.0, 5.0])[:, None])  # parts differ
+    learner = Learner(config(xi=xi), F, A)
+    whole = jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)
+    shared = Learner(config(xi=xi), F, A, "device")
+    parts = jax.tree.map(lambda x: x[:, None], data)
+    each = jax.jit(jax.vmap(shared.update, in_axes=(None, 0), axis_name="device"))(
+        learner.init(jax.random.PRNGKey(1)), parts
+    )
+    for device in range(B):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x[device], y, rtol=2e-4, atol=2e-6), each, whole)  # noqa: B023
+
+
+def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
+    """Targets and advantages are constants: scaling rewards by −1 leaves the critic's own pull, not a mixed one."""
+    learner = Learner(config(normalise_advantage=False), F, A)
+    state, data = learner.init(jax.random.PRNGKey(1)), batch()
+    gradient = jax.jit(jax.grad(lambda p: learner._loss(p, state, data)[0]))(state.params)
+
+    def critic_only(critic: object) -> jax.Array:
+        target = jax.lax.stop_gradient
+        params = state.params._replace(critic=critic)
+        value = learner.critic.apply(critic, data.observation)[..., 0]
+        loss, terms = learner._loss(params, state, data)
+        del loss
+        # value_loss = mean (V − V^trace)²: its gradient with a constant target is 2·mean (V − V^trace)·dV.
+        _, v_trace = _traces(learner, state, data)
+        return jnp.mean((value - target(v_trace)) ** 2) + 0.0 * terms.value
+
+    expected = jax.jit(jax.grad(critic_only))(state.params.critic)
+    jax.tree.map(lambda g, e: np.testing.assert_allclose(g, e, atol=1e-5), gradient.critic, expected)
+
+
+def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[jax.Array, jax.Array]:
+    c = learner.config
+    value = learner.critic.apply(state.params.critic, data.observation)[..., 0]
+    after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
+    log_pi = log_density(data.action, learner.policy.apply(state.params.policy, data.observation), c.sigma)
+    rho = jnp.exp(log_pi - data.log_mu)
+    after = jnp.where(data.out_of_bounds > 0, c.reward_scale * data.reward / (1.0 - c.gamma), after)
+    return jax.vmap(lambda *x: vtrace(*x, gamma=c.gamma, lam=c.lam))(
+        c.reward_scale * data.reward, value, after, data.terminated, data.truncated, rho
+    )
+
+
+def test_sigma_is_log_linear_and_ends_where_it_should() -> None:
+    """sigma at the start, sigma_end after the last update, the geometric mean half-way."""
+    learner = Learner(config(sigma=0.4, sigma_end=0.1), F, A)
+    state = learner.init(jax.random.PRNGKey(0))
+    at = lambda share: float(learner.sigma(state._replace(updates=jnp.int32(round(share * learner.total_updates)))))  # noqa: E731
+    np.testing.assert_allclose([at(0.0), at(0.5), at(1.0)], [0.4, 0.2, 0.1], rtol=1e-4)
+
+
+def test_average_is_the_mean_of_the_last_policies() -> None:
+    """With averaging on, what ships is the arithmetic mean of the policies of the run's last part."""
+    learner = Learner(config(steps=64 * 50 * 5, warmup_unrolls=1, updates_per_unroll=4, average_fraction=0.5), F, A)
+    state, data, update = learner.init(jax.random.PRNGKey(1)), batch(), jax.jit(learner.update)
+    policies = []
+    for _ in range(learner.total_updates):
+        state, _ = update(state, data)
+        policies.append(state.params.policy)
+    last = policies[learner.total_updates // 2 :]
+    expected = jax.tree.map(lambda *p: np.mean(p, axis=0), *last)
+    shipped = learner.shipped(state).params.policy
+    jax.tree.map(lambda s, e: np.testing.assert_allclose(s, e, rtol=1e-5, atol=1e-6), shipped, expected)
+
+
+def test_observation_statistics_standardise() -> None:
+    """With normalise_observations the networks see zero mean and unit deviation."""
+    learner = Learner(config(normalise_observations=True), F, A)
+    data = 3.0 + 2.0 * jax.random.normal(jax.random.PRNGKey(2), (4000, F))
+    state = learner.observe(learner.init(jax.random.PRNGKey(0)), data)
+    seen = learner.scale(state, data)
+    np.testing.assert_allclose(np.mean(seen, 0), 0.0, atol=1e-2)
+    np.testing.assert_allclose(np.std(seen, 0), 1.0, atol=1e-2)
+
+
+@pytest.fixture(scope="module")
+def traced() -> tuple[Hyper, object]:
+    """Every hyperparameter that travels, and one compiled program of what they decide, half-way through a run."""
+    here = config(observation_scale=[1.0] * F, steps=64 * 50 * 4, gradient_clip=0.1, sigma=1.0, sigma_end=1.0)
+    learner, data = Learner(here, F, A), batch()
+    state = learner.init(jax.random.PRNGKey(1))._replace(updates=jnp.int32(learner.total_updates // 2))
+
+    @jax.jit
+    def decided(values: Hyper) -> tuple[LearnerState, Terms, jax.Array, LearnerState]:
+        other = learner.under(values)
+        climbed, *_ = other.climb(
+            state, lambda now: (other.mean(now, data.observation).sum(axis=(1, 2)), jnp.ones(B)), jnp.int32(0)
+        )
+        return *other.update(state, data), other.sigma(state), climbed
+
+    return hyper(here), decided
+
+
+@pytest.mark.parametrize("name", TRACED)
+def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, name: str) -> None:
+    """One compiled program, another value: another result. (None that is declared traced is a constant in it.)"""
+    values, decided = traced
+    if name == "xi":  # whether it is there at all is static
+        values = values | {"xi": np.float32(0.01)}
+    first, second = decided(values), decided(values | {name: np.float32(0.5) * values[name] + np.float32(1e-4)})
+    assert any(
+        np.any(np.asarray(a) != np.asarray(b)) for a, b in zip(*map(jax.tree.leaves, (first, second)), strict=True)
+    )
+
+
+def test_other_values_make_the_learner_that_has_them(traced: tuple) -> None:
+    """Under another configuration's values a learner does what one of that configuration does."""
+    changes = {"gamma": 0.9, "epsilon": 0.05, "sigma": 0.5, "learning_rate": 1e-3, "reward_scale": 0.3}
+    there, data = Learner(config(**changes), F, A), batch()
+    here = Learner(config(), F, A).under(hyper(there.config))
+    np.testing.assert_array_equal(losses(here, data), losses(there, data))

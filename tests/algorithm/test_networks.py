@@ -1,0 +1,56 @@
+"""The networks against the same formula in plain `jnp`, gradients too: their last layer has its own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qrl.algorithm.networks import MLP
+
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
+F = 5
+
+
+def plain(params: dict, x: jax.Array) -> jax.Array:
+    """The same without flax."""
+    layers = [params["params"][f"Dense_{i}"] for i in range(len(params["params"]))]
+    for layer in layers[:-1]:
+        x = jnp.tanh(x @ layer["kernel"] + layer["bias"])
+    return x @ layers[-1]["kernel"] + layers[-1]["bias"]
+
+
+@pytest.mark.parametrize("outputs", [1, 4, 17])
+@pytest.mark.parametrize("shape", [(F,), (7, F), (3, 7, F)], ids=["one", "a row", "trajectories"])
+def test_gradients_are_those_of_the_plain_formula(outputs: int, shape: tuple[int, ...]) -> None:
+    """In parameters and inputs, of a loss that weighs every output differently."""
+    network = MLP((8, 6), outputs, "tanh", final_gain=1.0)
+    x = jax.random.normal(jax.random.PRNGKey(0), shape)
+    weights = jax.random.normal(jax.random.PRNGKey(1), (*shape[:-1], outputs))
+    params = network.init(jax.random.PRNGKey(2), x)
+
+    def gradient(apply: object) -> object:
+        return jax.jit(jax.grad(lambda p, x: jnp.sum(jnp.sin(apply(p, x)) * weights), argnums=(0, 1)))(params, x)
+
+    ours, theirs = gradient(network.apply), gradient(plain)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), ours, theirs)
+
+
+@pytest.mark.parametrize("axes", [(0, 0), (None, 0), (0, None)], ids=["members", "inputs", "parameters"])
+def test_gradients_of_members_side_by_side(axes: tuple[int | None, int | None]) -> None:
+    """Under vmap, within a rematerialised scan, as flights are differentiated."""
+    network = MLP((8,), 2, "tanh", final_gain=1.0)
+    x = jax.random.normal(jax.random.PRNGKey(0), (3, 4, F))
+    many = jax.vmap(lambda key: network.init(key, x[0]))(jax.random.split(jax.random.PRNGKey(2), 3))
+    params = many if axes[0] == 0 else jax.tree.map(lambda p: p[0], many)
+    inputs = x if axes[1] == 0 else x[0]
+
+    def gradient(apply: object) -> object:
+        def loss(p: dict, x: jax.Array) -> jax.Array:
+            step = jax.checkpoint(lambda o, _: (o + jnp.tile(apply(p, o), 3)[:, :F], None))
+            return jnp.sum(jax.lax.scan(step, x, None, length=3)[0] ** 2)
+
+        return jax.jit(jax.vmap(jax.grad(loss), in_axes=axes))(params, inputs)
+
+    ours, theirs = gradient(network.apply), gradient(plain)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, theirs)

@@ -1,0 +1,394 @@
+"""The rollout against a literal loop over one lane's steps, on a toy whose observation is its whole state."""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs.base import Env, State
+from scipy import stats
+
+from qrl.algorithm import rollout
+from qrl.algorithm.rollout import Lanes
+from qrl.algorithm.types import Transition
+from qrl_envs import env as worlds
+from qrl_envs import task
+
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
+Array = np.ndarray
+
+LANES, T, LONGEST, UNROLLS = 6, 6, 12, 5
+SIGMA = 0.9
+X, Y, CLOCK, GAIN, FENCE = range(5)
+GAINS = np.array([2.0, 1.0, 0.5, 0.2, 0.1, 0.02], np.float32)
+
+
+class Fenced(Env):
+    """A point that each action moves by gain·action/2; beyond the fence, in x or in y, its episode is over."""
+
+    @property
+    def observation_size(self) -> int:
+        return 5
+
+    @property
+    def action_size(self) -> int:
+        return 2
+
+    @property
+    def backend(self) -> str:
+        return "toy"
+
+    def reset(self, rng: jax.Array) -> State:
+        start = jax.random.uniform(rng, (2,), minval=-1.0, maxval=1.0)
+        return self.at(jnp.concatenate([start, jnp.array([0.0, 1.0, 1.2])]))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        move = jnp.concatenate([state.pipeline_state[GAIN] * action / 2, jnp.array([1.0, 0.0, 0.0])])
+        after = self.at(state.pipeline_state + move)
+        over = jnp.max(after.obs[:CLOCK]) > after.obs[FENCE]
+        return after.replace(reward=after.obs[X] - 2.0 * after.obs[Y] + jnp.sum(action**2), done=jnp.float32(over))
+
+    def at(self, x: jax.Array) -> State:
+        """The state that is observed as `x`."""
+        return State(x, x, jnp.float32(0.0), jnp.float32(0.0), {}, {})
+
+
+class Marked(Fenced):
+    """The same; leaving in y is a truncation by the environment's own word, and a restart keeps gain and fence.
+
+    Where x is positive too, it says that nothing begins there any more.
+    """
+
+    def at(self, x: jax.Array) -> State:
+        left = x[Y] > x[FENCE]
+        return (
+            super()
+            .at(x)
+            .replace(info={"truncated": jnp.float32(left), "out_of_bounds": jnp.float32(left & (x[X] > 0.0))})
+        )
+
+    def restart(self, state: State, rng: jax.Array) -> State:
+        kept = state.pipeline_state[GAIN:]
+        return self.at(jnp.concatenate([self.reset(rng).obs[:GAIN], kept]))
+
+
+def mean(observation: jax.Array) -> jax.Array:
+    """A policy that leans outward, and knows where it is."""
+    return 0.4 + 0.3 * observation[..., :CLOCK]
+
+
+class Flight(NamedTuple):
+    """Consecutive unrolls of one environment."""
+
+    env: Fenced
+    begun: Lanes
+    ended: Lanes
+    steps: Transition  # [N, UNROLLS·T, ...] NumPy
+
+
+@functools.cache
+def begin_of(env: Env) -> Callable[[jax.Array], Lanes]:
+    return jax.jit(lambda key: rollout.begin(env, key, jnp.arange(LANES), LANES, LONGEST, T))
+
+
+@functools.cache
+def unroll_of(env: Env) -> Callable[..., tuple[Lanes, Transition]]:
+    sigma = jnp.float32(SIGMA)
+    return jax.jit(
+        lambda lanes, key, starts: rollout.unroll(env, lanes, mean, sigma, key, starts, unroll_steps=T, longest=LONGEST)
+    )
+
+
+def fly(env: Fenced, lanes: Lanes, seed: int) -> Flight:
+    begun, unrolls = lanes, []
+    for i in range(UNROLLS):
+        lanes, transitions = unroll_of(env)(lanes, jax.random.key(1000 * seed + i), jax.random.key(seed))
+        unrolls.append(transitions)
+    steps = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *unrolls)
+    return Flight(env, begun, lanes, steps)
+
+
+PLAIN, MARKED = Fenced(), Marked()
+
+
+def begin(env: Fenced, seed: int, fence: float = 1.2) -> Lanes:
+    """Lanes of one environment, each with a gain of its own where a restart keeps it."""
+    lanes = begin_of(env)(jax.random.key(seed))
+    if env is PLAIN:
+        return lanes
+    x = np.array(lanes.state.obs)
+    x[:, GAIN], x[:, FENCE] = GAINS, fence
+    state = lanes.state.replace(pipeline_state=jnp.asarray(x), obs=jnp.asarray(x))
+    return lanes._replace(state=state, fresh=state)
+
+
+@functools.cache
+def flown(env: Fenced) -> Flight:
+    return fly(env, begin(env, seed=0), seed=0)
+
+
+@pytest.fixture(params=["plain", "marked"])
+def flight(request: pytest.FixtureRequest) -> Flight:
+    return flown({"plain": PLAIN, "marked": MARKED}[request.param])
+
+
+@pytest.fixture(scope="module")
+def unfenced() -> Flight:
+    """No episode ends before its time."""
+    return fly(MARKED, begin(MARKED, seed=2, fence=np.inf), seed=2)
+
+
+def ends(steps: Transition) -> Array:
+    """[N, K] whether an episode's last step."""
+    return (steps.terminated + steps.truncated).astype(bool)
+
+
+def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
+    """One lane after the other, one step after the other: the same actions from the same starts, all fields alike.
+
+    Termination is the environment's done unless it says that it truncated; an episode of LONGEST steps is truncated.
+    """
+    steps, step = flight.steps, jax.jit(flight.env.step)
+    seen = np.zeros(3, int)
+    for i in range(LANES):
+        state, age = flight.env.at(flight.begun.state.obs[i]), int(flight.begun.steps[i])
+        for t in range(UNROLLS * T):
+            np.testing.assert_allclose(steps.observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
+            state = step(state, np.clip(steps.action[i, t], -1.0, 1.0))
+            age += 1
+            terminated = bool(state.done) and not bool(state.info.get("truncated", 0.0))
+            truncated = not terminated and (bool(state.done) or age == LONGEST)
+            np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-5, atol=1e-5)
+            assert (steps.terminated[i, t], steps.truncated[i, t]) == (terminated, truncated)
+            assert steps.out_of_bounds[i, t] == (bool(state.done) and bool(state.info.get("out_of_bounds", 0.0)))
+            if (terminated or truncated) and t + 1 < UNROLLS * T:
+                seen += [terminated, bool(state.done) and truncated, not bool(state.done)]
+                state, age = flight.env.at(steps.observation[i, t + 1]), 0
+    terminations, own_truncations, out_of_time = seen
+    assert terminations > 3
+    assert out_of_time > 3 or flight.env is PLAIN
+    assert (own_truncations > 3) == (flight.env is MARKED)
+
+
+def test_next_observation_is_that_before_the_reset(flight: Flight) -> None:
+    """Beyond the fence or at the last second where an episode ended, while the observation after it is a start."""
+    steps, ended = flight.steps, ends(flight.steps)
+    beyond = steps.next_observation[..., :CLOCK].max(axis=-1) > steps.next_observation[..., FENCE]
+    out_of_time = steps.truncated.astype(bool) & ~beyond
+    np.testing.assert_array_equal(ended, beyond | out_of_time)
+    assert not (steps.observation[..., :CLOCK].max(axis=-1) > steps.observation[..., FENCE]).any()
+    following = steps.observation[:, 1:]
+    np.testing.assert_array_equal(following[..., CLOCK][ended[:, :-1]], 0.0)
+    np.testing.assert_array_equal(following[~ended[:, :-1]], steps.next_observation[:, :-1][~ended[:, :-1]])
+
+
+def starts(flight: Flight) -> Array:
+    """[n, 2] where episodes began: the very first, and the observation after every end."""
+    later = flight.steps.observation[:, 1:][ends(flight.steps)[:, :-1]]
+    return np.concatenate([flight.begun.state.obs, later])[:, :CLOCK]
+
+
+def test_every_episode_of_every_lane_starts_afresh(flight: Flight) -> None:
+    """No start twice: not the lane's first again, nor another lane's; also when a lane ends twice in an unroll."""
+    ended = ends(flight.steps).reshape(LANES, UNROLLS, T)
+    assert (ended.sum(axis=-1) >= 2).sum() >= 5
+    begun = starts(flight)
+    assert len(begun) > 4 * LANES
+    assert len(np.unique(begun, axis=0)) == len(np.unique(begun[:, X])) == len(begun)
+
+
+def test_starts_are_drawn_from_the_environments_reset() -> None:
+    """Uniform over its square: Kolmogorov–Smirnov over several flights."""
+    begun = np.concatenate([starts(fly(PLAIN, begin(PLAIN, seed), seed)) for seed in range(10, 20)])
+    assert len(begun) > 300
+    for coordinate in begun.T:
+        assert stats.kstest(coordinate, stats.uniform(-1.0, 2.0).cdf).pvalue > 0.01
+
+
+def test_a_restart_keeps_the_lanes_own_parameters() -> None:
+    """What the environment's `restart` keeps, a lane has from its first episode to its last."""
+    marked = flown(MARKED)
+    assert ends(marked.steps)[0].sum() > 3
+    np.testing.assert_array_equal(marked.steps.observation[..., GAIN], np.repeat(GAINS[:, None], UNROLLS * T, axis=1))
+
+
+def test_an_environment_without_the_mark_only_terminates(flight: Flight) -> None:
+    """Its done is a termination; a mark makes a truncation of it; the two never come together."""
+    steps = flight.steps
+    beyond_x, beyond_y = (steps.next_observation[..., i] > steps.next_observation[..., FENCE] for i in (X, Y))
+    expected = (beyond_x | beyond_y) if flight.env is PLAIN else beyond_x & ~beyond_y
+    np.testing.assert_array_equal(steps.terminated.astype(bool), expected)
+    assert not (steps.terminated * steps.truncated).any()
+    assert set(np.unique([steps.terminated, steps.truncated])) == {0.0, 1.0}
+
+
+def test_episodes_are_cut_at_the_longest(unfenced: Flight) -> None:
+    """Staggered lanes have their first end early, and then one every LONGEST steps: a truncation, across unrolls."""
+    np.testing.assert_array_equal(unfenced.begun.steps, [0, 0, 0, 6, 6, 6])
+    time = np.arange(1, UNROLLS * T + 1)
+    expected = (time + np.asarray(unfenced.begun.steps)[:, None]) % LONGEST == 0
+    np.testing.assert_array_equal(unfenced.steps.truncated, expected)
+    assert not unfenced.steps.terminated.any()
+    assert not expected[:, np.arange(UNROLLS * T) % T != T - 1].any()  # whole unrolls: ends at unroll ends alone
+
+
+@pytest.mark.parametrize(("lanes", "longest", "unroll_steps"), [(8, 40, 10), (7, 200, 50), (3, 100, 50), (5, 30, 50)])
+def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll_steps: int) -> None:
+    """Ages are multiples of an unroll, below the longest episode, spread over it as evenly as whole lanes can be."""
+    begun = jax.jit(lambda key: rollout.begin(PLAIN, key, jnp.arange(lanes), lanes, longest, unroll_steps))(
+        jax.random.key(0)
+    )
+    ages = np.asarray(begun.steps)
+    assert (ages % unroll_steps == 0).all()
+    assert ages.min() == 0
+    assert ages.max() < longest
+    _, counts = np.unique(ages, return_counts=True)
+    assert len(counts) == min(lanes, -(-longest // unroll_steps))
+    assert counts.max() - counts.min() <= 1
+    assert not begun.ended.any()
+    assert len(np.unique(begun.state.obs, axis=0)) == lanes
+
+
+def test_early_counts_the_episodes_cut_short(flight: Flight, unfenced: Flight) -> None:
+    """By the environment, before their last step; per lane, over all unrolls."""
+    late = flight.steps.next_observation[..., CLOCK] == LONGEST
+    first = np.cumsum(ends(flight.steps), axis=1) - ends(flight.steps) == 0
+    age = flight.steps.next_observation[..., CLOCK] + first * np.asarray(flight.begun.steps)[:, None]
+    cut_short = ends(flight.steps) & (age < LONGEST)
+    assert late.sum() < cut_short.sum()
+    np.testing.assert_array_equal(flight.ended.early, cut_short.sum(axis=1))
+    assert not unfenced.ended.early.any()
+
+
+def test_actions_are_recorded_as_drawn_and_flown_clipped(flight: Flight) -> None:
+    """The point moves by gain/2 at most, though actions beyond ±1 stand in the record."""
+    steps = flight.steps
+    assert (np.abs(steps.action) > 1.0).mean() > 0.1
+    moved = (steps.next_observation - steps.observation)[..., :CLOCK]
+    expected = steps.observation[..., GAIN, None] * np.clip(steps.action, -1.0, 1.0) / 2
+    np.testing.assert_allclose(moved, expected, atol=1e-6)
+
+
+def test_log_mu_is_scipys_normal_density(flight: Flight) -> None:
+    """Of the action as drawn, summed over its dimensions."""
+    center = 0.4 + 0.3 * flight.steps.observation[..., :CLOCK].astype(np.float64)
+    expected = stats.norm.logpdf(flight.steps.action.astype(np.float64), center, SIGMA).sum(axis=-1)
+    np.testing.assert_allclose(flight.steps.log_mu, expected, rtol=1e-5, atol=1e-5)
+
+
+def test_noise_is_standard_normal_and_never_repeats(flight: Flight) -> None:
+    """Over steps, lanes, dimensions and unrolls: Kolmogorov–Smirnov, and no value twice."""
+    center = 0.4 + 0.3 * flight.steps.observation[..., :CLOCK]
+    noise = (flight.steps.action - center) / SIGMA
+    assert stats.kstest(noise.ravel(), "norm").pvalue > 0.01
+    assert len(np.unique(noise.round(5))) > 0.99 * noise.size
+    apart = np.corrcoef(noise.reshape(LANES * UNROLLS, T * 2))
+    assert np.abs(apart - np.eye(len(apart))).mean() < 0.3
+
+
+def test_the_key_decides_everything() -> None:
+    """The same key repeats an unroll to the last bit, another changes every action."""
+    lanes = begin(MARKED, seed=3)
+    first, again, other = (unroll_of(MARKED)(lanes, jax.random.key(i), jax.random.key(3)) for i in (0, 0, 1))
+    for one, two in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert (np.asarray(first[1].action) != other[1].action).all()
+
+
+def test_members_side_by_side_fly_as_they_would_alone() -> None:
+    """vmapped, the draw of fresh starts under a condition becomes a selection: nothing else may change."""
+    lanes = [begin(MARKED, seed) for seed in (4, 5)]
+    keys = jax.random.split(jax.random.key(6), 2)
+    together = jax.jit(jax.vmap(unroll_of(MARKED)))(jax.tree.map(lambda *x: jnp.stack(x), *lanes), keys, keys)
+    for member in (0, 1):
+        alone = unroll_of(MARKED)(lanes[member], keys[member], keys[member])
+        for ours, expected in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(ours[member], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_a_lane_flies_as_it_would_without_its_neighbours() -> None:
+    """Starts, noise and stagger are a lane's own: half the lanes alone make the transitions that they make in a whole.
+
+    Neighbours decide when starts are drawn, and must not decide which.
+    """
+    begun = begin(MARKED, seed=7)
+    whole = fly(MARKED, begun, seed=7).steps
+    assert ends(whole).sum() > 3 * LANES
+    for half in (slice(0, 3), slice(3, 6)):
+        alone = fly(MARKED, jax.tree.map(lambda x, half=half: x[half], begun), seed=7).steps
+        for ours, expected in zip(alone, whole, strict=True):
+            np.testing.assert_allclose(ours, expected[half], rtol=1e-5, atol=1e-5)
+    first = jax.jit(lambda key: rollout.begin(MARKED, key, jnp.arange(3, 6), LANES, LONGEST, T))(jax.random.key(7))
+    of_all = begin_of(MARKED)(jax.random.key(7))
+    np.testing.assert_array_equal(first.state.obs, of_all.state.obs[3:])
+    np.testing.assert_array_equal(first.steps, of_all.steps[3:])
+
+
+def test_lanes_are_handed_on_before_the_reset(flight: Flight) -> None:
+    """The state after an unroll is the one last observed, its end marked for the next unroll to see."""
+    np.testing.assert_array_equal(flight.ended.state.obs, flight.steps.next_observation[:, -1])
+    np.testing.assert_array_equal(flight.ended.ended, ends(flight.steps)[:, -1])
+
+
+def test_the_longest_episode_is_the_configured_else_the_tasks_else_1000() -> None:
+    """Ours say their own."""
+    assert rollout.episode_steps(worlds.make("hover"), 77) == 77
+    assert rollout.episode_steps(worlds.make("hover"), None) == 200
+    assert rollout.episode_steps(PLAIN, None) == 1000
+
+
+@pytest.mark.parametrize("lanes", [8, 9], ids=["two blocks of 4", "three of 3"])
+def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With more lanes than a block's most, each lane does, to rounding, what it does among all at once.
+
+    But for when its next start is drawn, which is when some lane beside it needs one.
+    """
+    env = Marked()
+
+    def run() -> tuple[Any, ...]:
+        key = jax.random.PRNGKey(3)
+        begun = rollout.begin(env, key, jnp.arange(lanes), lanes, LONGEST, T)
+        mean, sigma = (lambda observation: jnp.zeros((*observation.shape[:-1], env.action_size))), jnp.float32(0.5)
+        after, steps = rollout.unroll(env, begun, mean, sigma, key, key, unroll_steps=3 * T, longest=LONGEST)
+        return steps, after.state, after.steps, after.ended, after.start + after.used, after.early
+
+    at_once = jax.jit(run)()
+    monkeypatch.setattr(rollout, "BLOCK_LANES", 4)
+    in_blocks = jax.jit(lambda: run())()
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), in_blocks, at_once)
+
+
+def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
+    """Our own environment, with bounds so near that most lanes leave them: the loop's steps, never a termination."""
+    spec = task.from_data({"extend": "hover", "start": {"velocity_m_s": 9.0}, "bounds": {"distance_m": 3.0}}, "here")
+    env, sigma = worlds.from_task(spec), jnp.float32(0.3)
+
+    def still(observation: jax.Array) -> jax.Array:
+        return jnp.zeros((*observation.shape[:-1], 4))
+
+    @jax.jit
+    def run(key: jax.Array) -> tuple[Lanes, Transition]:
+        lanes = rollout.begin(env, key, jnp.arange(4), 4, 100, 50)
+        return lanes, rollout.unroll(env, lanes, still, sigma, key, key, unroll_steps=50, longest=100)[1]
+
+    lanes, steps = run(jax.random.key(0))
+    step, fled = jax.jit(env.step), 0
+    for i in range(4):
+        state = jax.tree.map(lambda x, i=i: x[i], lanes.state)
+        for t in range(50):
+            state = step(state, jnp.clip(steps.action[i, t], -1.0, 1.0))
+            np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-3, atol=1e-3)
+            np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-3, atol=1e-3)
+            if state.done:
+                fled += 1
+                assert np.linalg.norm(steps.next_observation[i, t, 9:12]) > 3.0
+                assert steps.truncated[i, t] == 1
+                assert t == 49 or np.abs(steps.observation[i, t + 1, 9:12]).max() <= 2.0
+                break
+    assert fled >= 2
+    assert not np.asarray(steps.terminated).any()

@@ -1,0 +1,194 @@
+"""`qrl export` as a user meets it: the whole folder or nothing, and one clear line for every run that has no policy."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from brax.envs.fast import Fast
+
+import policies
+from cli_helpers import TINY, complaint, qrl
+from qrl.evaluation import trained_run
+from qrl.export import targets
+from qrl.export.kernel import PossibleOverflow
+from qrl.export.targets import ProofFailed
+
+LEAST = ("--starts", "8", "--vectors", "500")
+FILES = policies.EMITTED | {"report.md"}
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few flights to calibrate on, and no Cortex-M: test_prove.py has those."""
+    monkeypatch.setattr(trained_run, "CALIBRATION_STARTS", 10)
+    monkeypatch.setattr(targets, "missing_tools", lambda: ["the cross compiler"])
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny run."""
+    return Path(shutil.copytree(trained, tmp_path / "pendulum", ignore=shutil.ignore_patterns("export")))
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_an_export_is_whole_and_the_same_again(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It replaces what was there, file by file."""
+    assert qrl("export", run, *LEAST) == 0
+    said = capsys.readouterr().out
+    assert "NOT proved on Cortex-M, nor measured: this machine lacks the cross compiler" in said
+    assert f"{run}/export/qrl_policy.c" in said
+    first = contents(run / "export")
+    assert set(first) == FILES
+    manifest = json.loads(first["manifest.json"])
+    assert (manifest["task"], manifest["run"], manifest["env_steps"]) == ("pendulum", "pendulum", 400)
+    assert manifest["commit"] == json.loads((run / "config.json").read_text())["versions"]["commit"]
+    assert [port["name"] for port in manifest["obs"]] == ["cos_theta", "sin_theta", "theta_dot"]
+    assert manifest["network"] == [3, 4, 1]
+    for name, text in first.items():
+        assert str(run.parent).encode() not in text, name
+    (run / "export" / "mine.txt").write_text("from an earlier export")
+    (run / "export" / "report.md").write_text("old")
+    assert qrl("export", run, *LEAST) == 0
+    assert contents(run / "export") == first
+    assert {path.name for path in run.iterdir()} - {"export"} <= {
+        *("config.json", "metrics.csv", "checkpoints", "tensorboard", "summary.json"),
+        *("lock", "learning_curve.png", "flight.png", "evaluation.json", "evaluation.png"),
+    }
+
+
+@pytest.mark.parametrize("raised", [ProofFailed("M0: a bit differs"), PossibleOverflow("layer 0, output 1: past 2^31")])
+def test_a_proof_that_fails_leaves_what_was_there(
+    raised: Exception, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Exit code 1, one line; nothing where nothing was."""
+
+    def fail(*_: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(trained_run, "prove" if isinstance(raised, ProofFailed) else "quantise", fail)
+    before = contents(run)
+    for had in (False, True):
+        if had:
+            (run / "export").mkdir()
+            (run / "export" / "qrl_policy.c").write_text("earlier")
+            before = contents(run)
+        capsys.readouterr()
+        assert qrl("export", run, *LEAST) == 1
+        assert capsys.readouterr().err == f"qrl: {raised}\n"
+        assert contents(run) == before
+        assert (run / "export").exists() == had
+        assert not list(run.glob(".*"))
+
+
+def test_missed_gates_are_a_warning(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An untrained policy: the first lines of the report, and exit code 0."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("qrl.export.report.Gate.met", property(lambda self: not self.name.startswith("action error, R")))
+        assert qrl("export", run, *LEAST) == 0
+    title, empty, warning, *_ = (run / "export" / "report.md").read_text().splitlines()
+    assert title.startswith("# pendulum: 3-4-1")
+    assert not empty
+    assert warning.startswith("> **Warning: missed: action error, RMSE: ")
+    assert "MISSED" in capsys.readouterr().out
+
+
+def test_without_a_compiler_it_exports_unproved(
+    run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.undo()
+    monkeypatch.setattr(trained_run, "CALIBRATION_STARTS", 10)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert qrl("export", run, *LEAST) == 0
+    said, report = capsys.readouterr().out, (run / "export" / "report.md").read_text()
+    missing = ("on this machine: no C compiler (cc)", "this machine lacks arm-none-eabi-gcc, arm-none-eabi-size, qemu")
+    for what in missing:
+        assert re_in("NOT proved", what, said)
+        assert re_in("Not proved", what, report)
+    assert "held against the reference" not in said
+    assert "gave what the NumPy reference gives" not in report
+
+
+def re_in(head: str, what: str, text: str) -> bool:
+    return any(head in line and what in line for line in text.splitlines())
+
+
+def test_a_foreign_environment_exports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One of Brax's own, the one that compiles at once: all that is known of its ports is their order."""
+    run = tmp_path / "run"
+    assert qrl("train", "fast", "--out", run, "--episode-steps", "20", *TINY.split()) == 0
+    assert "'fast' does not say its control period" in complaint(capsys, "export", run, *LEAST)
+    monkeypatch.setattr(Fast, "dt", 0.02, raising=False)  # as all but this one do
+    assert qrl("export", run, *LEAST) == 0
+    manifest = json.loads((run / "export" / "manifest.json").read_text())
+    assert [port["name"] for port in manifest["obs"]] == ["o0", "o1"]
+    assert [(port["name"], port["unit"]) for port in manifest["act"]] == [("a0", "?")]
+    assert manifest["control_period_s"] == 0.02
+    assert set(contents(run / "export")) == FILES
+
+
+# -- refused -------------------------------------------------------------------------------------------------
+
+
+def altered(run: Path, **changes: object) -> None:
+    config = json.loads((run / "config.json").read_text())
+    learner = changes.pop("learner", {})
+    (run / "config.json").write_text(json.dumps(config | changes | {"learner": config["learner"] | learner}))
+
+
+def truncated(run: Path) -> None:
+    """Every file of the last checkpoint's arrays loses its second half."""
+    for path in (run / "checkpoints" / "400").rglob("*"):
+        if path.is_file() and path.stat().st_size > 300:
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+BROKEN = {
+    "no run": (lambda run: (run / "config.json").unlink(), "not a run folder"),
+    "no checkpoints": (lambda run: shutil.rmtree(run / "checkpoints"), "no checkpoint"),
+    "no checkpoint": (
+        lambda run: [shutil.rmtree(path) for path in (run / "checkpoints").iterdir() if path.is_dir()],
+        "no checkpoint",
+    ),
+    "half a checkpoint": (truncated, "checkpoints/400/"),
+    "another format": (lambda run: altered(run, format=2), "key 'format'"),
+    "not JSON": (lambda run: (run / "config.json").write_text('{"format": 1,'), "config.json"),
+    "several seeds": (lambda run: altered(run, seeds=3), "holds 3 seeds; name one of them, such as RUN="),
+    "another network": (lambda run: altered(run, learner={"policy_hidden": [8]}), "of another run than config.json"),
+    "one layer more": (lambda run: altered(run, learner={"policy_hidden": [4, 4]}), "of another run than config.json"),
+    "an activation": (lambda run: altered(run, learner={"activation": "gelu"}), "key 'learner.activation'"),
+}
+
+
+@pytest.mark.parametrize("damage", BROKEN)
+def test_what_cannot_be_exported_is_one_clear_line(damage: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Exit code 2; nothing is left behind."""
+    change, says = BROKEN[damage]
+    change(run)
+    before = contents(run)
+    line = complaint(capsys, "export", run, *LEAST)
+    assert says in line
+    assert str(run) in line
+    assert contents(run) == before
+    assert not list(run.glob(".*"))
+
+
+def test_a_network_without_a_form_is_refused(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object) -> None:
+        raise trained_run.Inexpressible("layer 1: a weight is not finite")
+
+    monkeypatch.setattr(trained_run, "quantise", fail)
+    assert complaint(capsys, "export", run, *LEAST) == f"qrl: {run}: layer 1: a weight is not finite\n"
+    assert not (run / "export").exists()
+
+
+@pytest.mark.parametrize("flag", ["--starts", "--vectors"])
+def test_wrong_counts_are_refused(flag: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert flag in complaint(capsys, "export", run, flag, "few")

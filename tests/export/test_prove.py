@@ -1,0 +1,417 @@
+"""The emitted C is the NumPy reference, to the bit, on the host and on four cores, at what the bars allow it to cost.
+
+And where it is not, the proof says so. Without the cross tools the cores are skipped; QRL_REQUIRE_CROSS=1 fails then.
+"""
+
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import policies
+from cross_targets import EACH, EITHER, M0, M4F, need
+from policies import FLAT, HOVER, ODD, PENDULUM
+from qrl.export import emit, targets
+from qrl.export import kernel as reference
+from qrl.export.kernel import Dense, Kernel
+from qrl.export.prove import Expected, compare, prove
+from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, Outputs, ProofFailed
+
+MANY, FEW = 10_000, 600
+SANITISED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
+SMALL = [PENDULUM, ODD, FLAT]
+BOTH = pytest.mark.parametrize("activation", ["relu", "tanh"])
+
+
+@cache
+def expected(sizes: tuple[int, ...], activation: str, n: int) -> Expected:
+    return Expected.of(policies.policy(sizes, activation), policies.kernel(sizes, activation), n)
+
+
+@pytest.fixture(scope="module")
+def kernel_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[int, ...], str], Path]:
+    """The export folder of a policy of policies.py."""
+
+    @cache
+    def folder(sizes: tuple[int, ...], activation: str) -> Path:
+        policy, kernel = policies.policy(sizes, activation), policies.kernel(sizes, activation)
+        return policies.emitted(tmp_path_factory.mktemp("export"), policy, kernel)
+
+    return folder
+
+
+KernelOf = Callable[[tuple[int, ...], str], Path]
+
+
+def assert_same(found: Outputs, wanted: Expected) -> None:
+    """Written apart from prove.compare."""
+    np.testing.assert_array_equal(found.status, wanted.status)
+    np.testing.assert_array_equal(found.status_i16, wanted.status_i16)
+    np.testing.assert_array_equal(found.act_i16, wanted.act_i16)
+    np.testing.assert_array_equal(np.ascontiguousarray(found.act).view(np.uint32), wanted.act.view(np.uint32))
+    assert found.selftest == 0
+
+
+def test_the_vectors_are_of_every_kind() -> None:
+    """What the proofs below rest on."""
+    wanted, kernel = expected(HOVER, "relu", MANY), policies.kernel(HOVER)
+    assert len(wanted.obs) == len(wanted.obs_i16) == MANY
+    assert min(np.bincount(wanted.status, minlength=3)) > 100
+    assert min(np.bincount(wanted.status_i16, minlength=2)) > 500
+    low, high = ((steps * kernel.lsb).astype(np.float32) for steps in (kernel.least, kernel.most))
+    for vector in (low, high, 0 * high):
+        assert (wanted.obs == vector).all(axis=1).any()
+    for value in (0, 32767, -32767, -32768):
+        assert (wanted.obs_i16 == value).all(axis=1).any()
+    assert ((wanted.obs_i16 == kernel.least) | (wanted.obs_i16 == kernel.most)).all(axis=1).sum() > 100
+    size = np.abs(wanted.obs)
+    assert ((size > 0) & (size < 1.17e-38)).any()
+    assert np.isnan(wanted.obs).any(axis=0).all()
+    assert np.isinf(wanted.obs).any(axis=0).all()
+    act = wanted.act_i16
+    assert ((act == kernel.act_least).any(axis=0) & (act == kernel.act_most).any(axis=0)).all()
+    assert len(np.unique(act, axis=0)) > MANY // 4
+
+
+# -- on this machine -----------------------------------------------------------------------------------------
+
+HOST_FLAGS = {
+    "strict": STRICT,
+    "firmware": FIRMWARE,
+    "-O0": ("-std=c99", "-O0"),
+    "-O3 fast": ("-std=c99", "-O3", "-ffast-math", "-ffp-contract=fast", "-march=native"),
+    "-Os": ("-std=gnu17", "-Os", "-fno-strict-aliasing", "-funsigned-char"),
+    "sanitised": SANITISED,
+    "x87": ("-std=c99", "-O2", "-mfpmath=387"),
+    "32 bits, x87": ("-std=c99", "-O2", "-m32", "-mfpmath=387"),
+}
+
+
+def builds(flags: tuple[str, ...], folder: Path) -> bool:
+    """Whether programs can be compiled and run so here."""
+    compiler = targets.host_compiler()
+    (folder / "probe.c").write_text("#include <stdio.h>\n#include <stdint.h>\nint main(void) { return 0; }\n")
+    command = [str(compiler), *flags, "probe.c", "-o", "probe"]
+    built = subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0
+    return built and subprocess.run(["./probe"], cwd=folder, check=False).returncode == 0
+
+
+@pytest.mark.usefixtures("host")
+@BOTH
+@pytest.mark.parametrize("how", HOST_FLAGS)
+def test_the_host_gives_the_references_bits(how: str, activation: str, kernel_of: KernelOf, tmp_path: Path) -> None:
+    flags = HOST_FLAGS[how]
+    if how not in ("strict", "firmware", "-O0") and not builds(flags, tmp_path):
+        pytest.skip(f"this compiler cannot do {' '.join(flags)}")
+    wanted = expected(HOVER, activation, MANY)
+    found = targets.run_host(kernel_of(HOVER, activation), tmp_path, flags, wanted.obs, wanted.obs_i16)
+    assert_same(found, wanted)
+
+
+@EITHER
+@pytest.mark.parametrize("sizes", SMALL, ids=str)
+def test_odd_shapes_give_the_references_bits(
+    sizes: tuple[int, ...], core: Core | None, kernel_of: KernelOf, tmp_path: Path
+) -> None:
+    """Sizes that are no multiple of four, one input layer alone, one output."""
+    for activation in ("relu", "tanh"):
+        wanted, folder = expected(sizes, activation, FEW), kernel_of(sizes, activation)
+        if core is None:
+            found = targets.run_host(folder, tmp_path, SANITISED, wanted.obs, wanted.obs_i16)
+        else:
+            found, _ = targets.run_core(core, folder, tmp_path, RELEASE, wanted.obs, wanted.obs_i16)
+        assert_same(found, wanted)
+
+
+# -- on the cores --------------------------------------------------------------------------------------------
+
+Cases = dict[tuple[str, str], tuple[Outputs, Counts, targets.Sizes]]
+
+
+@pytest.fixture(scope="module")
+def cases(kernel_of: KernelOf, tmp_path_factory: pytest.TempPathFactory) -> Cases:
+    """Both hover policies on every core."""
+    need(targets.missing_tools())
+    work = tmp_path_factory.mktemp("cores")
+
+    def run(case: tuple[str, Core]) -> tuple[Outputs, Counts, targets.Sizes]:
+        activation, core = case
+        folder, wanted = kernel_of(HOVER, activation), expected(HOVER, activation, MANY)
+        outputs, counts = targets.run_core(core, folder, work, RELEASE, wanted.obs, wanted.obs_i16)
+        return outputs, counts, targets.size(core, folder, work)
+
+    each = [(activation, core) for activation in ("relu", "tanh") for core in CORES]
+    for activation in ("relu", "tanh"):  # before the threads: what is cached is made once
+        kernel_of(HOVER, activation)
+        expected(HOVER, activation, MANY)
+    with ThreadPoolExecutor(2) as pool:
+        return {(a, core.name): case for (a, core), case in zip(each, pool.map(run, each), strict=True)}
+
+
+@EACH
+@BOTH
+def test_every_core_gives_the_references_bits(activation: str, core: Core, cases: Cases) -> None:
+    wanted = expected(HOVER, activation, MANY)
+    assert len(wanted.obs) >= 10_000
+    assert_same(cases[activation, core.name][0], wanted)
+
+
+BARS = {"M0": (34_000, 28_000), "M3": (None, 18_500), "M4F": (11_500, None), "M7": (11_500, None)}
+
+
+@EACH
+@BOTH
+def test_it_costs_no_more_than_the_bars(activation: str, core: Core, cases: Cases) -> None:
+    """Instructions: mean over flights. Flash, stack, static RAM: of the whole object, and of each entry."""
+    _, counts, size = cases[activation, core.name]
+    step, step_i16 = BARS[core.name]
+    flights = slice(0, MANY // 2)
+    assert 5_504 / 2 < counts.i16[flights].mean() <= (step_i16 or np.inf)  # two multiply-adds an instruction at best
+    assert 5_504 / 2 < counts.f32[flights].mean() <= (step or np.inf)
+    assert size.text + size.data <= 9216
+    assert (size.data, size.bss) == (0, 0)
+    assert 0 < counts.stack_f32 <= 512
+    assert 0 < counts.stack_i16 <= 512
+
+
+@EACH
+@BOTH
+def test_the_time_it_takes_hardly_varies(activation: str, core: Core, cases: Cases) -> None:
+    """Fixed trip counts: whatever is observed, within a twentieth of the mean; what is not finite ends early."""
+    _, counts, _ = cases[activation, core.name]
+    wanted = expected(HOVER, activation, MANY)
+    for each in (counts.i16, counts.f32[wanted.status < 2]):
+        assert np.ptp(each) < 0.1 * each.mean()
+    assert counts.f32[wanted.status == 2].max() < counts.f32.mean()
+
+
+@pytest.mark.parametrize("core", [M0, M4F], ids=["M0", "M4F"], indirect=True)
+@pytest.mark.parametrize("flags", [("-Os",), ("-O0",), FIRMWARE], ids=" ".join)
+@BOTH
+def test_the_assembly_bears_any_optimisation(
+    activation: str,
+    flags: tuple[str, ...],
+    core: Core,
+    kernel_of: KernelOf,
+    tmp_path: Path,
+) -> None:
+    wanted = expected(HOVER, activation, FEW)
+    found, _ = targets.run_core(core, kernel_of(HOVER, activation), tmp_path, flags, wanted.obs, wanted.obs_i16)
+    assert_same(found, wanted)
+
+
+@pytest.mark.usefixtures("cross")
+@pytest.mark.parametrize(
+    ("cpu", "instruction"),
+    [
+        ("cortex-m4", "smlad"),
+        ("cortex-m7", "smlad"),
+        ("cortex-m33", "smlad"),
+        ("cortex-m0plus", "muls"),
+        ("cortex-m23", "muls"),
+        ("cortex-m3", "mla"),
+    ],
+)
+def test_each_core_gets_its_body(cpu: str, instruction: str, kernel_of: KernelOf, tmp_path: Path) -> None:
+    """And the strictest warnings hold for all three."""
+    source = kernel_of(HOVER, "tanh") / "qrl_policy.c"
+    command = ["arm-none-eabi-gcc", *STRICT, f"-mcpu={cpu}", "-mthumb", "-S", str(source), "-o", "kernel.s"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assembly = (tmp_path / "kernel.s").read_text()
+    assert re.search(rf"^\s+{instruction}\b", assembly, re.MULTILINE)
+    assert ("smlad" in assembly) == (instruction == "smlad")
+
+
+def test_cppcheck_finds_nothing(kernel_of: KernelOf) -> None:
+    need([] if shutil.which("cppcheck") else ["cppcheck"])
+    for sizes, activation in ((HOVER, "relu"), (ODD, "tanh")):
+        # Members that only align, or that one body of three does not use.
+        command = ["cppcheck", "--quiet", "--error-exitcode=3", "--std=c99"]
+        command += ["--enable=warning,style,performance,portability", "--suppress=unusedStructMember"]
+        command += ["--suppress=missingIncludeSystem", "qrl_policy.c"]
+        done = subprocess.run(command, cwd=kernel_of(sizes, activation), capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+
+
+# -- bad input -----------------------------------------------------------------------------------------------
+
+
+@EITHER
+def test_bad_input_is_answered(core: Core | None, kernel_of: KernelOf, tmp_path: Path) -> None:
+    """Not finite: 2 and hover thrust, wherever it stands and however -ffast-math would have it; too far: 1."""
+    policy, kernel = policies.policy(HOVER), policies.kernel(HOVER)
+    good = policy.calibration[:1].repeat(18, axis=0)
+    rows, each = np.arange(18), []
+    for value in (np.nan, -np.nan, np.inf, -np.inf):
+        each.append(good.copy())
+        each[-1][rows, rows] = value
+    far = good.copy()
+    far[rows, rows] = 1.01 * np.where(rows % 2, kernel.most, kernel.least) * kernel.lsb
+    obs, steps = np.concatenate([*each, far, good]), np.zeros((1, 18), np.int16)
+    if core is None:
+        found = targets.run_host(kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, obs, steps)
+    else:
+        found, _ = targets.run_core(core, kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, obs, steps)
+    np.testing.assert_array_equal(found.status, np.repeat([2, 2, 2, 2, 1, 0], 18))
+    np.testing.assert_allclose(found.act[:72], 0.667 * 9.81 / 4, rtol=1e-3)
+    assert np.isfinite(found.act).all()
+    saturated = good.copy()
+    saturated[rows, rows] = np.where(rows % 2, kernel.most, kernel.least) * kernel.lsb
+    np.testing.assert_array_equal(found.act[72:90], reference.step(kernel, saturated)[1])
+
+
+# -- the proof is able to fail -------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(targets, "missing_tools", lambda: ["the cross compiler"])
+
+
+@pytest.mark.usefixtures("host", "no_cores")
+def test_a_sound_kernel_is_proved(kernel_of: KernelOf) -> None:
+    proof = prove(policies.policy(ODD), policies.kernel(ODD), kernel_of(ODD, "relu"), FEW)
+    assert proof.held == ["this machine", "this machine with -O3 -ffast-math"]
+    assert proof.missing == ["on Cortex-M, nor measured: this machine lacks the cross compiler"]
+    assert (proof.costs, proof.vectors) == ([], FEW)
+
+
+@pytest.mark.usefixtures("cross", "host")
+def test_all_that_is_here_is_proved_and_measured(kernel_of: KernelOf) -> None:
+    proof = prove(policies.policy(ODD, "tanh"), policies.kernel(ODD, "tanh"), kernel_of(ODD, "tanh"), 300)
+    assert proof.held == ["this machine", "this machine with -O3 -ffast-math", "M0", "M3", "M4F", "M7"]
+    assert proof.missing == []
+    assert [cost.core for cost in proof.costs] == ["M0", "M3", "M4F", "M7"]
+    for cost in proof.costs:
+        assert 100 < cost.step_i16[0] < cost.step[0] <= cost.step[1]
+        assert cost.static_ram == 0
+        assert cost.float32
+        assert cost.float32 > cost.step[0]
+
+
+def changed(kernel: Kernel, layer: int, **values: np.ndarray | int) -> Kernel:
+    layers = list(kernel.layers)
+    layers[layer] = replace(layers[layer], **values)
+    return replace(kernel, layers=tuple(layers))
+
+
+def bumped(kernel: Kernel, layer: int, what: str, by: int = 1) -> Kernel:
+    values = getattr(kernel.layers[layer], what).copy()
+    values.flat[0] += by if values.flat[0] < 127 or what != "weight" else -by
+    return changed(kernel, layer, **{what: values})
+
+
+def without_rounding(layer: Dense) -> np.ndarray:
+    """Biases without the half that rounds."""
+    return layer.bias - np.round(2.0 ** (15 + layer.shift) / layer.multiplier).astype(np.int64)
+
+
+FAULTS: dict[str, Callable[[Kernel], Kernel]] = {
+    "a weight of the first layer": lambda k: bumped(k, 0, "weight"),
+    "a weight of the last layer": lambda k: bumped(k, -1, "weight"),
+    "a bias of the first layer": lambda k: bumped(k, 0, "bias"),
+    "a bias of the last layer": lambda k: bumped(k, -1, "bias"),
+    "a multiplier": lambda k: bumped(k, 1, "multiplier"),
+    "a shift": lambda k: changed(k, 1, shift=k.layers[1].shift ^ 1),
+    "rounding": lambda k: changed(k, -1, bias=without_rounding(k.layers[-1])),
+    "a limit": lambda k: replace(k, most=k.most - (np.arange(len(k.most)) == 0)),
+    "a scale": lambda k: replace(k, scale=k.scale - (np.arange(len(k.scale)) == 1)),
+    "an exponent": lambda k: replace(k, exponent=k.exponent + (np.arange(len(k.scale)) == 0)),
+    "the safe action": lambda k: replace(k, act_safe=np.nextafter(k.act_safe, np.float32(9))),
+    "the step of an action": lambda k: replace(k, act_lsb=np.nextafter(k.act_lsb, np.float32(9))),
+    "the least action": lambda k: replace(k, act_least=k.act_least + 1),
+    "the activation": lambda k: replace(k, activation="tanh"),
+}
+
+
+@pytest.mark.usefixtures("host")
+@pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS.keys())
+def test_one_step_of_a_difference_fails_the_proof(fault: Callable[[Kernel], Kernel], tmp_path: Path) -> None:
+    """Emitted from another kernel than it is held against; its golden vectors are not what finds it."""
+    policy, kernel = policies.policy(ODD), policies.kernel(ODD)
+    other = fault(kernel)
+    folder = policies.emitted(tmp_path, policy, other, emit.golden(policy, other))
+    obs, obs_i16, *_ = wanted = expected(ODD, "relu", FEW)
+    found = targets.run_host(folder, tmp_path, ("-O0",), obs, obs_i16)
+    assert found.selftest == 0
+    with pytest.raises(ProofFailed, match=r"^here: .*qrl_policy_step.* differs from the reference in"):
+        compare("here", found, wanted)
+
+
+@pytest.mark.usefixtures("host", "no_cores")
+def test_the_proof_of_another_kernel_fails(tmp_path: Path) -> None:
+    policy, kernel = policies.policy(ODD), policies.kernel(ODD)
+    other = bumped(kernel, -1, "bias")
+    folder = policies.emitted(tmp_path, policy, other)
+    prove(policy, other, folder, FEW)
+    with pytest.raises(ProofFailed, match=r"^this machine: qrl_policy_step differs from the reference in"):
+        prove(policy, kernel, folder, FEW)
+
+
+SOURCE_FAULTS = {
+    "no saturation": ("z > 32767 ? 32767 : z < -32768 ? -32768 : z", "z"),
+    "rounds down": ("+ 1u) / 2u", ") / 2u"),
+    "infinity passes": ("(in.bits & 0x7f800000u) == 0x7f800000u", "in.real != in.real"),
+    "status of a clip": ("return within != q;", "return 0;"),
+    "an input out of place": ("x->one[i] = (activation)", "x->one[i ^ 1] = (activation)"),
+    "an action out of place": ("act[i] = action(y[i], i);", "act[i] = action(y[i ^ 1], i);"),
+}
+
+
+@pytest.mark.usefixtures("host")
+@pytest.mark.parametrize("fault", SOURCE_FAULTS.values(), ids=SOURCE_FAULTS.keys())
+def test_a_slip_in_the_source_shows(fault: tuple[str, str], tmp_path: Path) -> None:
+    policy, kernel = policies.policy(FLAT), policies.kernel(FLAT)
+    narrow = kernel.layers[0]  # its outputs pass 16 bits now and then
+    kernel = replace(kernel, layers=(replace(narrow, multiplier=narrow.multiplier, shift=max(narrow.shift - 3, 0)),))
+    folder = policies.emitted(tmp_path, policy, kernel)
+    source = (folder / "qrl_policy.c").read_text()
+    assert fault[0] in source
+    (folder / "qrl_policy.c").write_text(source.replace(*fault))
+    wanted = Expected.of(policy, kernel, FEW)
+    found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
+    with pytest.raises(ProofFailed, match="differs from the reference"):
+        compare("here", found, wanted)
+
+
+@pytest.mark.usefixtures("host")
+@pytest.mark.parametrize("table", ["obs", "obs_i16", "act", "status"])
+def test_the_self_test_reads_its_table(table: str, tmp_path: Path) -> None:
+    """With another entry in a golden vector it fails, and the proof with it; all outputs are right."""
+    policy, kernel = policies.policy(ODD), policies.kernel(ODD)
+    golden = emit.golden(policy, kernel)
+    values = getattr(golden, table).copy()
+    values[1] = values[1] + 1 if table in ("act", "status") else values[0]
+    folder = policies.emitted(tmp_path, policy, kernel, replace(golden, **{table: values}))
+    wanted = expected(ODD, "relu", FEW)
+    found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
+    assert found.selftest == 2
+    with pytest.raises(ProofFailed, match=r"here: the self-test failed \(2\)"):
+        compare("here", found, wanted)
+
+
+def test_a_difference_is_named() -> None:
+    wanted = expected(ODD, "relu", FEW)
+    outputs = Outputs(wanted.status, wanted.act, wanted.status_i16, wanted.act_i16, 0)
+    compare("M0", outputs, wanted)
+    for name, value in (("status", 1), ("status_i16", 1), ("act_i16", 1)):
+        wrong = getattr(wanted, name).copy()
+        wrong[7] += value
+        with pytest.raises(ProofFailed, match=r"M0: .*_i16" if "i16" in name else r"M0: status of .*in vector 7"):
+            compare("M0", outputs._replace(**{name: wrong}), wanted)
+    bit = wanted.act.copy()
+    bit.view(np.int32)[9, 1] ^= 1
+    with pytest.raises(ProofFailed, match=r"M0: qrl_policy_step differs .* in 1 places, first in vector 9"):
+        compare("M0", outputs._replace(act=bit), wanted)
+    with pytest.raises(ProofFailed, match=r"M0: status of qrl_policy_step: .* values, not"):
+        compare("M0", outputs._replace(status=wanted.status[1:]), wanted)
+    with pytest.raises(ProofFailed, match=r"M0: the self-test failed \(-7\)"):
+        compare("M0", outputs._replace(selftest=-7), wanted)

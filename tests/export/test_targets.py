@@ -1,0 +1,334 @@
+"""The prover is proved: on a small kernel with known answers, costs and stack, and on kernels with one fault each.
+
+Without the cross compiler or QEMU the target's tests are skipped; QRL_REQUIRE_CROSS=1 makes that a failure.
+"""
+
+from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from cross_targets import EACH, EITHER, M0, M3, M4F, M7, need
+from qrl.export import baseline, targets
+from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, Outputs, ProofFailed
+
+HEADER = """\
+#include <stdint.h>
+#define QRL_POLICY_OBS_SIZE {obs}
+#define QRL_POLICY_ACT_SIZE {act}
+int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]);
+int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]);
+int qrl_policy_selftest(void);
+"""
+# Copies, with statuses: float to float by bits, int16 to int16 after a loop of 2 * rounds instructions.
+# F32_STACK bytes of stack in one entry, I16_STACK in the other.
+SOUND = """\
+#include "qrl_policy.h"
+#include <string.h>
+#define F32_STACK 1000
+#define I16_STACK 200
+
+int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE])
+{
+    volatile uint8_t touched[F32_STACK];
+    for (int i = 0; i < F32_STACK; i++) {
+        touched[i] = 0;
+    }
+    memcpy(act, obs, sizeof(float) * QRL_POLICY_ACT_SIZE);
+    /* end of f32 */
+    return touched[0] + (obs[0] > 0.0f);
+}
+
+int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE])
+{
+    volatile uint8_t touched[I16_STACK];
+    for (int i = 0; i < I16_STACK; i++) {
+        touched[i] = 0;
+    }
+#ifdef __arm__
+    uint32_t rounds = (uint32_t)(obs[0] & 0xff) + 1u;
+    __asm__ volatile(".syntax unified\\n1: subs %0, #1\\n bne 1b" : "+l"(rounds) : : "cc");
+#endif
+    memcpy(act, obs, sizeof(int16_t) * QRL_POLICY_ACT_SIZE);
+    /* end of i16 */
+    return touched[0] + (obs[0] > 0 ? 2 : 0);
+}
+
+int qrl_policy_selftest(void)
+{
+    /* selftest */
+    return 0;
+}
+"""
+VECTORS = 301  # more than ten chunks, the last one partly filled
+RNG = np.random.default_rng(0)
+OBS_F32 = RNG.integers(0, 2**32, (VECTORS, 18), np.uint32).view(np.float32)  # any bits: infinities and NaN among them
+OBS_I16 = RNG.integers(-(2**15), 2**15, (VECTORS - 7, 18), np.int16)
+ODD = 77  # the vector that faults wait for
+
+
+def write(folder: Path, *faults: tuple[str, str], obs: int = 18, act: int = 4) -> Path:
+    """The sound kernel, with each (old, new) replaced."""
+    source = SOUND
+    for old, new in faults:
+        assert old in source
+        source = source.replace(old, new)
+    folder.mkdir(exist_ok=True)
+    (folder / "qrl_policy.h").write_text(HEADER.format(obs=obs, act=act), encoding="utf-8")
+    (folder / "qrl_policy.c").write_text(source, encoding="utf-8")
+    return folder
+
+
+class Case(NamedTuple):
+    run: targets.Outputs
+    counts: Counts
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
+    """The sound kernel on every core, all started at once."""
+    need(targets.missing_tools())
+    work = tmp_path_factory.mktemp("sound")
+    kernel = write(work / "kernel")
+
+    def run(core: Core) -> Case:
+        return Case(*targets.run_core(core, kernel, work, RELEASE, OBS_F32, OBS_I16))
+
+    with ThreadPoolExecutor(len(CORES)) as pool:
+        return dict(zip((core.name for core in CORES), pool.map(run, CORES), strict=True))
+
+
+def on(core: Core | None, kernel: Path, work: Path, timeout_s: float = targets.TIMEOUT_S) -> Outputs:
+    """`kernel` on a core, or on the host where there is none."""
+    if core is None:
+        return targets.run_host(kernel, work, RELEASE, OBS_F32, OBS_I16, timeout_s=timeout_s)
+    return targets.run_core(core, kernel, work, RELEASE, OBS_F32, OBS_I16, timeout_s=timeout_s)[0]
+
+
+def bits(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, np.float32).view(np.uint32)
+
+
+def assert_sound(run: Outputs, *, statuses: bool = True) -> None:
+    np.testing.assert_array_equal(bits(run.act), bits(OBS_F32[:, :4]))
+    np.testing.assert_array_equal(run.act_i16, OBS_I16[:, :4])
+    np.testing.assert_array_equal(run.status_i16, 2 * (OBS_I16[:, 0] > 0))
+    if statuses:
+        np.testing.assert_array_equal(run.status, (OBS_F32[:, 0] > 0).astype(int))
+    assert run.selftest == 0
+
+
+@EACH
+def test_every_output_comes_back_from_a_core(core: Core, cases: dict[str, Case]) -> None:
+    assert_sound(cases[core.name].run)
+
+
+@pytest.mark.usefixtures("host")
+@pytest.mark.parametrize(
+    "flags", [STRICT, FIRMWARE, (*RELEASE, "-fsanitize=address,undefined", "-fno-sanitize-recover")]
+)
+def test_every_output_comes_back_from_the_host(flags: tuple[str, ...], tmp_path: Path) -> None:
+    run = targets.run_host(write(tmp_path / "kernel"), tmp_path, flags, OBS_F32, OBS_I16)
+    assert_sound(run, statuses="-ffast-math" not in flags)  # where a comparison with NaN may say anything
+
+
+@EITHER
+def test_one_output_and_an_odd_layout(core: Core | None, tmp_path: Path) -> None:
+    kernel = write(tmp_path / "kernel", obs=3, act=1)
+    obs_f32, obs_i16 = OBS_F32[:, :3], OBS_I16[:, 4:7]
+    if core is None:
+        run = targets.run_host(kernel, tmp_path, RELEASE, obs_f32, obs_i16)
+    else:
+        run = targets.run_core(core, kernel, tmp_path, FIRMWARE, obs_f32, obs_i16)[0]
+    np.testing.assert_array_equal(bits(run.act), bits(obs_f32[:, :1]))
+    np.testing.assert_array_equal(run.act_i16, obs_i16[:, :1])
+
+
+@EITHER
+def test_one_lsb_shows(core: Core | None, tmp_path: Path) -> None:
+    flip = f"if (memcmp(&act[1], &(uint32_t){{{bits(OBS_F32)[ODD, 1]}u}}, 4) == 0) {{ ((uint8_t *)&act[2])[0] ^= 1; }}"
+    add = f"if (obs[0] == {OBS_I16[ODD, 0]} && obs[1] == {OBS_I16[ODD, 1]}) {{ act[3] ^= 1; }}"
+    kernel = write(tmp_path / "kernel", ("/* end of f32 */", flip), ("/* end of i16 */", add))
+    run = on(core, kernel, tmp_path)
+    assert np.argwhere(bits(run.act) != bits(OBS_F32[:, :4])).tolist() == [[ODD, 2]]
+    assert np.argwhere(run.act_i16 != OBS_I16[:, :4]).tolist() == [[ODD, 3]]
+
+
+@EITHER
+def test_outputs_left_alone_show(core: Core | None, tmp_path: Path) -> None:
+    run = on(core, write(tmp_path / "kernel", ("* QRL_POLICY_ACT_SIZE", "* (QRL_POLICY_ACT_SIZE - 1)")), tmp_path)
+    assert set(bits(run.act)[:, 3]) == {0xA5A5A5A5}
+    assert set(run.act_i16.view(np.uint16)[:, 3]) == {0xA5A5}
+
+
+@EITHER
+@pytest.mark.parametrize("entry", ["f32", "i16"])
+def test_a_write_beyond_the_outputs_fails(entry: str, core: Core | None, tmp_path: Path) -> None:
+    beyond = f"volatile int four = QRL_POLICY_ACT_SIZE; if (obs[0] == obs[0]) {{ act[four] = 0; }} /* end of {entry} */"
+    kernel = write(tmp_path / "kernel", (f"/* end of {entry} */", beyond))
+    with pytest.raises(ProofFailed, match=rf"{'step_i16' if entry == 'i16' else 'step'} writes beyond its outputs"):
+        on(core, kernel, tmp_path)
+
+
+@EITHER
+def test_a_crash_fails(core: Core | None, tmp_path: Path) -> None:
+    crash = f"if (obs[1] == {OBS_I16[ODD, 1]}) {{ void (*volatile nothing)(void) = 0; nothing(); }}"
+    kernel = write(tmp_path / "kernel", ("/* end of i16 */", crash))
+    with pytest.raises(ProofFailed, match="host: the run broke off .signal" if core is None else "took a fault"):
+        on(core, kernel, tmp_path)
+
+
+@EITHER
+def test_a_hang_fails(core: Core | None, tmp_path: Path) -> None:
+    hang = f'while (obs[1] == {OBS_I16[ODD, 1]}) {{ __asm__ volatile(""); }}'
+    kernel = write(tmp_path / "kernel", ("/* end of i16 */", hang))
+    with pytest.raises(ProofFailed, match=r"no end after 0.7 s"):
+        on(core, kernel, tmp_path, timeout_s=0.7)
+
+
+@EITHER
+def test_the_selftests_answer_is_passed_on(core: Core | None, tmp_path: Path) -> None:
+    assert on(core, write(tmp_path / "kernel", ("return 0;", "return -7;")), tmp_path).selftest == -7
+
+
+LINE = (
+    f"obs=18 act=4 vectors_f32={len(OBS_F32)} vectors_i16={len(OBS_I16)} selftest=0"  # all that the host's reader needs
+)
+
+
+@pytest.mark.usefixtures("host")
+@pytest.mark.parametrize(
+    ("selftest", "words"),
+    [
+        ("exit(0);", "0 result lines"),
+        ("exit(3);", r"broke off \(exit 3\)"),
+        (f'fputs("qrl-proof: {LINE}\\n", stderr);', "2 result lines"),
+        (f'fputs("qrl-proof: {LINE}\\n", stderr); _exit(0);', "out.bin has"),
+        (f'fputs("qrl-proof: {LINE.replace("=18", "=3")}\\n", stderr); _exit(0);', "obs is 3, not 18"),
+        (f'fputs("qrl-proof: {LINE.replace("f32=3", "f32=2")}\\n", stderr); _exit(0);', "vectors_f32 is 201, not 301"),
+    ],
+)
+def test_an_end_that_is_not_the_harnesss_own_fails(selftest: str, words: str, tmp_path: Path) -> None:
+    heads = ("#include <string.h>", "#include <stdio.h>\n#include <stdlib.h>\n#include <string.h>\n#include <unistd.h>")
+    kernel = write(tmp_path / "kernel", heads, ("/* selftest */", selftest))
+    with pytest.raises(ProofFailed, match=words):
+        targets.run_host(kernel, tmp_path, FIRMWARE, OBS_F32, OBS_I16)
+
+
+@pytest.mark.usefixtures("cross")
+def test_a_restart_on_a_core_fails(tmp_path: Path) -> None:
+    kernel = write(
+        tmp_path / "kernel", ("/* selftest */", "void (**volatile reset)(void) = (void (**)(void))4; (*reset)();")
+    )
+    with pytest.raises(ProofFailed, match=r"no end after|took a fault"):
+        on(M3, kernel, tmp_path, timeout_s=0.7)
+
+
+@EITHER
+def test_a_compilers_complaint_is_one_line(core: Core | None, tmp_path: Path) -> None:
+    kernel = write(tmp_path / "kernel", ("/* selftest */", "int unused;"))
+    with pytest.raises(ProofFailed, match=r"gcc|cc|clang") as failure:
+        on(core, kernel, tmp_path)
+    assert "unused" in str(failure.value)
+    assert "\n" not in str(failure.value)
+
+
+@pytest.mark.usefixtures("cross")
+@pytest.mark.parametrize("call", ["tanhf(obs[0])", "(uintptr_t)malloc((unsigned)obs[0])"])
+def test_a_kernel_that_needs_more_than_libgcc_does_not_link(call: str, tmp_path: Path) -> None:
+    heads = ("#include <string.h>", "#include <math.h>\n#include <stdlib.h>\n#include <string.h>")
+    kernel = write(tmp_path / "kernel", heads, ("/* end of f32 */", f"act[0] = (float){call};"))
+    with pytest.raises(ProofFailed, match="undefined reference"):
+        on(M3, kernel, tmp_path)
+
+
+@EACH
+def test_instructions_are_counted_for_each_call(core: Core, cases: dict[str, Case]) -> None:
+    counts = cases[core.name].counts
+    assert (counts.f32.shape, counts.i16.shape) == ((len(OBS_F32),), (len(OBS_I16),))
+    fixed = counts.i16 - 2 * (OBS_I16[:, 0] & 0xFF)
+    assert np.ptp(fixed) <= 2 * targets.CLOCK_ERROR
+    # Two hundred stores in a loop of three to six instructions, then a copy.
+    assert 3 * 200 < fixed.mean() < 6 * 200 + 100
+    assert abs(counts.selftest - 2) <= targets.CLOCK_ERROR  # the zero, and the return
+
+
+@EACH
+def test_a_clock_of_another_speed_fails(core: Core, tmp_path: Path) -> None:
+    wrong = core._replace(tick=core.tick * 1.01)
+    with pytest.raises(ProofFailed, match="SysTick does not tick every"):
+        on(wrong, write(tmp_path / "kernel"), tmp_path)
+
+
+def test_the_clock_is_held_to_its_error() -> None:
+    targets.check_clock(M0, {0: 3.0, 1000: 2003.0 + targets.CLOCK_ERROR})
+    with pytest.raises(ProofFailed, match="a loop of 2003 instructions was measured as 1994"):
+        targets.check_clock(M0, {0: 3.0, 1000: 1994.0})
+
+
+@EACH
+def test_the_stack_of_each_entry_is_seen(core: Core, cases: dict[str, Case]) -> None:
+    counts = cases[core.name].counts
+    assert 1000 <= counts.stack_f32 <= 1064
+    assert 200 <= counts.stack_i16 <= 264
+    assert 0 <= counts.stack_selftest <= 16
+
+
+@pytest.mark.parametrize("core", [M0, M7], ids=["M0", "M7"], indirect=True)
+def test_a_stack_that_overflows_fails(core: Core, tmp_path: Path) -> None:
+    kernel = write(tmp_path / "kernel", ("F32_STACK 1000", "F32_STACK 6200"))
+    with pytest.raises(ProofFailed, match=r"all of the stack|took a fault|broke off .signal"):
+        on(core, kernel, tmp_path)
+
+
+@EACH
+def test_sizes(core: Core, tmp_path: Path) -> None:
+    tables = (
+        "#define F32_STACK 1000",
+        "#define F32_STACK 1000\nextern const int8_t weights[1000];\nconst int8_t weights[1000] = {1};\n"
+        "extern int32_t three[3], sixteen[16];\nint32_t three[3] = {1, 2, 3};\nint32_t sixteen[16];",
+    )
+    small = targets.size(core, write(tmp_path / "small"), tmp_path)
+    kernel = write(tmp_path / "kernel", tables, ("/* end of f32 */", "act[0] = obs[1] * obs[2];"))
+    large = targets.size(core, kernel, tmp_path)
+    assert (small.data, small.bss, large.data, large.bss) == (0, 0, 12, 64)
+    assert 1000 <= large.text - small.text <= 1032
+    if core in (M4F, M7):
+        assert large.library == small.library
+    else:
+        assert large.library - small.library > 100  # a multiplication in software
+
+
+def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert targets.missing_tools() == ["arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"]
+    with pytest.raises(ProofFailed, match="no C compiler"):
+        targets.run_host(tmp_path, tmp_path, RELEASE, OBS_F32, OBS_I16)
+
+
+def network(rng: np.random.Generator, *widths: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [(rng.normal(size=(i, o)) / i**0.5, 0.1 * rng.normal(size=o)) for i, o in pairwise(widths)]
+
+
+@pytest.mark.parametrize("activation", ["tanh", "relu"])
+@EITHER
+def test_the_baselines_are_the_network(core: Core | None, activation: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    layers, obs = network(rng, 18, 24, 16, 4), rng.normal(size=(40, 18))
+    baseline.write(tmp_path / "kernel", layers, activation, obs)
+    int8 = baseline.naive(layers, activation, obs)
+    obs_i16 = baseline.to_int8(int8, obs)
+    if core is None:
+        run = targets.run_host(tmp_path / "kernel", tmp_path, RELEASE, obs, obs_i16, baseline.LIBRARIES)
+    else:
+        run, _ = targets.run_core(core, tmp_path / "kernel", tmp_path, RELEASE, obs, obs_i16, baseline.LIBRARIES)
+    act = obs
+    for weight, bias in layers[:-1]:
+        act = np.tanh(act @ weight + bias) if activation == "tanh" else np.maximum(act @ weight + bias, 0)
+    act = act @ layers[-1][0] + layers[-1][1]
+    np.testing.assert_allclose(run.act, act, atol=2e-6)
+    np.testing.assert_array_equal(run.act_i16, baseline.infer(int8, obs_i16))
+    assert np.abs(run.act_i16 * int8.act_scale - act).mean() < 0.02 * np.abs(act).max()

@@ -1,0 +1,67 @@
+"""Train a little over 1, 2 and 8 of the devices that there are; what comes of it goes into a folder.
+
+A program of its own, for `test_devices`: how many devices a CPU has is settled before JAX starts.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from qrl.config import Config, load_preset
+from qrl.training import driver
+from qrl.training.sharding import spread
+from qrl.training.state import point, stack
+from qrl.training.trainer import Trainer
+from qrl_envs import env as worlds
+
+LITTLE = {
+    "lanes": 16,
+    "unroll_steps": 10,
+    "episode_steps": 20,
+    "ring_unrolls": 3,
+    "warmup_unrolls": 2,
+    "updates_per_unroll": 5,
+    "minibatch_lanes": 16,
+    "policy_hidden": [16],
+    "critic_hidden": [16],
+    "normalise_observations": True,
+    "report_flights": 5,
+    "apg_fraction": 0.5,
+    "apg_lanes": 16,
+    "apg_steps": 20,
+}
+TEN_UPDATES = 3  # unrolls
+CLIMBS = 3
+
+
+def named(tree: Any) -> dict[str, np.ndarray]:
+    return {jax.tree_util.keystr(path): np.asarray(leaf) for path, leaf in jax.tree.leaves_with_path(tree)}
+
+
+def main(folder: Path) -> None:
+    env = worlds.make("pendulum")
+    config = Config.model_validate(load_preset("pendulum") | LITTLE, strict=False)
+    saved = None
+    for seeds, count in ((1, 1), (1, 2), (1, 8), (2, 8)):
+        points = stack([point(env, config)] * seeds)
+        trainer = Trainer(env, config, spread(jax.devices()[:count], seeds, config.logical_shards))
+        states = trainer.advance(trainer.init(driver.seeds(5, seeds), points), points, np.int32(TEN_UPDATES))
+        flights = trainer.fly(states.learner, points, driver.report_starts(config))
+        np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.on_host((states, flights))))
+        if seeds == 1:
+            saved = saved or trainer.member(states, 0)  # from one device, as a checkpoint has it
+            further = trainer.advance(trainer.place(stack([saved])), points, np.int32(TEN_UPDATES + 1))
+            np.savez(folder / f"further-{count}.npz", **named(trainer.on_host(further)))
+            if count == 2:
+                continue
+            learnt = trainer.place(stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))
+            until = config.learning_unrolls + CLIMBS * config.unrolls_per_climb
+            climbed = trainer.climb(learnt, points, np.int32(until))
+            np.savez(folder / f"climbed-{count}.npz", **named(trainer.on_host(climbed)))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,132 @@
+"""Policies without training: seeded networks of any shape, with flights made up for them to be calibrated on."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from qrl.export import emit
+from qrl.export.kernel import Kernel
+from qrl.export.policy import ACTIVATIONS, Acted, Observed, Origin, Policy
+from qrl.export.quantise import quantise
+from qrl_envs import io_spec
+from qrl_envs import task as tasks
+
+ORIGIN = Origin("made-up", "hover", "reach a point and hover there", "0123456789ab", 3, 1_234_567)
+HOVER, PENDULUM, ODD, FLAT = (18, 64, 64, 4), (3, 64, 64, 1), (5, 7, 3, 2), (18, 4)
+
+# What an export holds, but for its report.
+EMITTED = {
+    "examples/bare_metal/CMakeLists.txt",
+    "examples/bare_metal/Makefile",
+    "examples/bare_metal/main.c",
+    "examples/qrl_policy/qrl_policy.ino",
+    "golden.csv",
+    "library.json",
+    "library.properties",
+    "manifest.json",
+    "qrl_policy.c",
+    "qrl_policy.h",
+}
+
+
+def hover_flights(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Observations [n, 18]: attitudes, positions, velocities and rates from a wild start to rest at the hover point."""
+    left = rng.uniform(0.01, 1.0, (n, 1)) ** 2  # how much of the start is left
+    x, y, z = left.T * rng.normal(size=(3, n))
+    w = np.sqrt(1.0 - np.minimum(x**2 + y**2 + z**2, 1.0))
+    size = np.sqrt(w**2 + x**2 + y**2 + z**2)
+    w, x, y, z = w / size, x / size, y / size, z / size
+    rotation = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    moving = left * rng.normal(size=(n, 9)) * np.repeat([1.0, 1.5, 4.0], 3)
+    return np.concatenate([np.array(rotation).reshape(9, n).T, moving], axis=1).astype(np.float32)
+
+
+def pendulum_flights(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Observations [n, 3], many of them at rest near upright."""
+    left = rng.uniform(0.0, 1.0, n) ** 3
+    angle = left * rng.uniform(-np.pi, np.pi, n)
+    return np.stack([np.cos(angle), np.sin(angle), left * rng.normal(size=n) * 4.0], axis=1).astype(np.float32)
+
+
+def odd_flights(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Observations [n, 5] far from zero and of very different sizes."""
+    sizes, middles = np.array([1e-3, 1.0, 300.0, 0.05, 7.0]), np.array([2e-3, 0.0, -900.0, 1.0, 20.0])
+    return (middles + sizes * rng.normal(size=(n, 5))).astype(np.float32)
+
+
+def _ports(sizes: tuple[int, ...]) -> tuple[tuple[Observed, ...], tuple[Acted, ...]]:
+    name = {(18, 4): "hover", (3, 1): "pendulum"}.get((sizes[0], sizes[-1]))
+    if name:
+        task = tasks.load(name)
+        return (
+            tuple(Observed(*port) for port in io_spec.observations(task)),
+            tuple(Acted(*port) for port in io_spec.actions(task)),
+        )
+    return (
+        tuple(Observed(f"o{i}", "?", "as it comes") for i in range(sizes[0])),
+        tuple(Acted(f"a{i}", "?", "as it comes", 0.5 * i, 2.0 + i, -1.5, 2.0, 0.25) for i in range(sizes[-1])),
+    )
+
+
+@cache
+def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0, samples: int = 1500) -> Policy:
+    """A lively policy of these layer sizes: actions spread over their range, some of them clipped.
+
+    The odd one normalises its observations and clips them, as a run with `normalise_observations` does.
+    """
+    rng = np.random.default_rng([seed, *sizes])
+    flights = {18: hover_flights, 3: pendulum_flights, 5: odd_flights}[sizes[0]](rng, samples)
+    normalised = sizes == ODD
+    observed, acted = _ports(sizes)
+    made = Policy(
+        origin=ORIGIN,
+        control_period_s=0.05 if sizes[0] == 3 else 0.01,
+        observed=observed,
+        acted=acted,
+        observation_offset=flights.mean(axis=0, dtype=float) if normalised else np.zeros(sizes[0]),
+        observation_gain=1.0 / flights.std(axis=0, dtype=float) if normalised else np.ones(sizes[0]),
+        observation_clip=10.0 if normalised else np.inf,
+        observation_scale=rng.uniform(0.25, 1.0, sizes[0]),
+        layers=tuple(
+            (rng.normal(size=(i, o)) * (2.0 / i) ** 0.5, 0.1 * rng.normal(size=o)) for i, o in pairwise(sizes)
+        ),
+        activation=activation,
+        calibration=flights,
+    )
+    *rest, (weight, bias) = made.layers
+    a = outputs(made, flights)
+    weight, middle = 0.7 * weight / a.std(axis=0), 0.7 * (a - bias).mean(axis=0) / a.std(axis=0)
+    return replace(made, layers=(*rest, (weight, bias - middle)))
+
+
+def outputs(policy: Policy, observations: np.ndarray) -> np.ndarray:
+    """The network's own outputs [n, A], written apart from Policy."""
+    x = (observations.astype(np.float64) - policy.observation_offset) * policy.observation_gain
+    x = np.minimum(np.maximum(x, -policy.observation_clip), policy.observation_clip) * policy.observation_scale
+    for i, (weight, bias) in enumerate(policy.layers):
+        x = np.einsum("ni,io->no", x, weight) + bias
+        if i < len(policy.layers) - 1:
+            x = ACTIVATIONS[policy.activation](x)
+    return x
+
+
+@cache
+def kernel(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0) -> Kernel:
+    """`policy` of the same arguments, quantised once for all tests."""
+    return quantise(policy(sizes, activation, seed))
+
+
+def emitted(folder: Path, policy: Policy, kernel: Kernel, golden: emit.Golden | None = None) -> Path:
+    """All that is emitted but the report, written to `folder`."""
+    for name, text in emit.files(policy, kernel, golden or emit.golden(policy, kernel)).items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    return folder

@@ -1,0 +1,265 @@
+"""Grid files: which points they stand for, and one clear line for every way they can be wrong."""
+
+import itertools
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from qrl import tasks
+from qrl.config import TRACED, Config, load_preset
+from qrl.sweep import grid
+from qrl.sweep.axes import Axis
+from qrl_envs.specfile import BadInput
+
+GRIDS = Path(__file__).resolve().parents[2] / "experiments" / "grids"
+
+
+def load(folder: Path, data: Any, budget: float = 1e9) -> grid.Grid:
+    path = folder / "grid.json"
+    path.write_text(json.dumps(data))
+    return grid.load(path, budget)
+
+
+def spec(point: grid.GridPoint) -> dict[str, Any]:
+    assert point.task.spec is not None
+    return point.task.spec
+
+
+def test_every_hyperparameter_is_declared_traced_or_static() -> None:
+    """Once each; counts, shapes and choices can only be static, and what is traced is a number or numbers."""
+    for name, field in Config.model_fields.items():
+        assert len({"traced", "static"} & set(field.metadata)) == 1, name
+    config = Config.model_validate(tasks.task_preset(tasks.task_record("hover"), ""), strict=False)
+    assert set(TRACED) - set(config.traced) == {"xi"}  # null there
+    assert all(isinstance(v, float) or all(isinstance(x, float) for x in v) for v in config.traced.values())
+    assert not set(config.static) & set(TRACED)
+
+
+@pytest.mark.parametrize("path", sorted(GRIDS.glob("*.json")), ids=lambda path: path.stem)
+def test_shipped_grids_are_valid(path: Path) -> None:
+    """Each can start, is of the paper's method alone, and asks for the programs that its static axes make."""
+    found = grid.load(path, 1e9)
+    programs = {"pendulum_lr": 2, "epsilon_replay": 4, "circle_weights": 1, "ablation_pendulum": 7, "ablation_hover": 7}
+    assert len(found.groups()) == programs[path.stem]
+    for point in found.points:
+        assert point.learner.steps <= 3e6
+        assert not point.learner.climbs
+        tasks.check(tasks.environment(point.task), point.learner, "")
+
+
+def test_the_three_grids_of_the_paper_ship() -> None:
+    assert {"pendulum_lr", "epsilon_replay", "circle_weights"} <= {path.stem for path in GRIDS.glob("*.json")}
+
+
+def test_points_are_the_product_of_the_axes(tmp_path: Path) -> None:
+    """Every combination once, in the axes' order, laid over `fixed`, over the task's preset."""
+    axes = {"gamma": [0.9, 0.95], "task.rod.mass_kg": [1.0, 2.0], "lanes": [8, 16]}
+    found = load(tmp_path, {"task": "pendulum", "fixed": {"sigma": 0.7}, "axes": axes, "seeds": [3, 5]})
+    seen = [(p.learner.gamma, spec(p)["rod"]["mass_kg"], p.learner.lanes) for p in found.points]
+    assert seen == list(itertools.product(*axes.values()))
+    assert {(p.learner.sigma, p.learner.activation) for p in found.points} == {(0.7, "tanh")}
+    assert found.seeds == (3, 5)
+    assert [[found.points[i].learner.lanes for i in group] for group in found.groups()] == [[8] * 4, [16] * 4]
+
+
+@pytest.mark.parametrize("spacing", ["lin", "log"])
+def test_ranges_are_evenly_spaced(tmp_path: Path, spacing: str) -> None:
+    """As NumPy spaces them, both ends exact."""
+    span = {"from": 1e-4, "to": 1e-2, "count": 5, "spacing": spacing}
+    found = [p.learner.sigma for p in load(tmp_path, {"task": "hover", "axes": {"sigma": span}}).points]
+    expected = np.geomspace(1e-4, 1e-2, 5) if spacing == "log" else np.linspace(1e-4, 1e-2, 5)
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    assert (found[0], found[-1]) == (1e-4, 1e-2)
+
+
+def test_samples_are_uniform_and_repeatable(tmp_path: Path) -> None:
+    """Draws of a range spread evenly over it (log: over its logarithm); the same seed draws the same points."""
+    data = {
+        "task": "hover",
+        "axes": {"sigma": {"from": 1e-4, "to": 1.0, "spacing": "log"}, "gamma": {"from": 0.5, "to": 1.0}},
+        "sample": {"count": 400, "seed": 7},
+    }
+    found = load(tmp_path, data)
+    logs = np.array([math.log(p.learner.sigma / 1e-4) / math.log(1e4) for p in found.points])
+    gammas = np.array([(p.learner.gamma - 0.5) / 0.5 for p in found.points])
+    for draws in (logs, gammas):  # Kolmogorov–Smirnov at 1 in 10,000
+        assert np.max(np.abs(np.sort(draws) - np.arange(400) / 400)) < 2.2 / 20
+    assert abs(np.corrcoef(logs, gammas)[0, 1]) < 0.2
+    assert [p.place for p in load(tmp_path, data).points] == [p.place for p in found.points]
+    data["sample"] = {"count": 400, "seed": 8}
+    assert [p.place for p in load(tmp_path, data).points] != [p.place for p in found.points]
+
+
+def test_a_path_reaches_into_the_vehicle(tmp_path: Path) -> None:
+    """One motor by its number, all by *; what is not named stays, and the shipped task is not changed."""
+    one = load(tmp_path, {"task": "hover", "axes": {"task.vehicle.motors.2.max_N": [5.0, 6.0]}})
+    assert [[m["max_N"] for m in spec(p)["vehicle"]["motors"]] for p in one.points] == [
+        [8.0, 8.0, 5.0, 8.0],
+        [8.0, 8.0, 6.0, 8.0],
+    ]
+    every = load(tmp_path, {"task": "hover", "axes": {"task.vehicle.motors.*.max_N": [5.0, 6.0]}})
+    assert [m["max_N"] for m in spec(every.points[0])["vehicle"]["motors"]] == [5.0] * 4
+    assert len(one.groups()) == len(every.groups()) == 1
+
+
+def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
+    named = {"ours": {}, "PPO": {"ring_unrolls": 1, "lam": 0.93}}
+    preset = load_preset("pendulum")
+    ours = ("ours", preset["ring_unrolls"], preset["lam"])
+    found = load(tmp_path, {"task": "pendulum", "axes": {"method": named, "gamma": [0.9, 0.99]}})
+    assert [(p.place["method"], p.learner.ring_unrolls, p.learner.lam) for p in found.points] == [
+        ours,
+        ours,
+        ("PPO", 1, 0.93),
+        ("PPO", 1, 0.93),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("axis", "values", "programs"),
+    [
+        ("task.reward.w1_attitude", [0.1, 0.2], 1),
+        ("task.vehicle.inertia_kg_m2", [[0.002, 0.002, 0.003], [0.0023, 0.0025, 0.0037]], 1),
+        ("task.start.position_m", [0.5, 2.0], 1),
+        ("task.bounds.distance_m", [5.0, 20.0], 1),
+        ("observation_scale", [[0.5] * 18, [1.0] * 18], 1),
+        ("observation_scale", [None, [1.0] * 18], 2),
+        ("xi", [0.1, 0.2], 1),
+        ("xi", [None, 0.2], 2),
+        ("task.episode_steps", [100, 200], 2),
+        ("form", ["ratio", "difference"], 2),
+        ("minibatch_lanes", [8, 16], 2),
+    ],
+)
+def test_only_static_values_make_programs(tmp_path: Path, axis: str, values: list, programs: int) -> None:
+    """Numbers travel; shapes, counts, choices and whether an optional one is there make groups."""
+    assert len(load(tmp_path, {"task": "hover", "axes": {axis: values}}).groups()) == programs
+
+
+def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -> None:
+    """Null starts and rewards of an evaluation are those of training; ours, which say theirs, may train otherwise."""
+    evaluation = {"start": None, "reward": None}
+    task = tmp_path / "task.json"
+    task.write_text(json.dumps({"extend": "pendulum", "evaluation": evaluation}))
+    for axis, what in (("task.reward.w_torque_1_N2m2", "reward"), ("task.start.angle_rad", "start")):
+        axes = {axis: [0.1, 0.2]}
+        assert len(load(tmp_path, {"task": "pendulum", "axes": axes}).points) == 2
+        with pytest.raises(BadInput, match=f"judged alike, found another {what}"):
+            load(tmp_path, {"task": str(task), "axes": axes})
+    load(tmp_path, {"task": "pendulum", "axes": {"episode_steps": [100, 200]}})
+
+
+GAMMA = {"gamma": [0.9, 0.99]}
+WRONG: dict[str, tuple[dict, str]] = {
+    "misspelt axis": ({"axes": {"gama": [0.9]}}, r"axes: unknown key 'gama' \(did you mean 'gamma'\?\)"),
+    "misspelt path": (
+        {"axes": {"task.rod.mas_kg": [1.0]}},
+        r"unknown key 'task.rod.mas_kg' \(did you mean 'task.rod.mass_kg'\?\)",
+    ),
+    "misspelt in fixed": ({"axes": GAMMA, "fixed": {"sigm": 1.0}}, r"fixed: unknown key 'sigm' .*'sigma'"),
+    "misspelt key": ({"axis": {}, "axes": GAMMA}, r"unknown key 'axis' \(did you mean 'axes'\?\)"),
+    "misspelt in a range": (
+        {"axes": {"gamma": {"from": 0.1, "too": 0.2, "count": 2}}},
+        r"axes.gamma: unknown key 'too' \(did you mean 'to'\?\)",
+    ),
+    "misspelt in named settings": ({"axes": {"m": {"a": {"gama": 1}}}}, r"unknown key 'gama'.*'gamma'"),
+    "no task": ({"task": None, "axes": GAMMA}, r"key 'task': expected a valid string, found null"),
+    "unknown task": ({"task": "pendulm", "axes": GAMMA}, r"unknown task 'pendulm' \(did you mean 'pendulum'"),
+    "no axes": ({}, r"key 'axes' is missing"),
+    "axes empty": ({"axes": {}}, r"key 'axes'"),
+    "empty axis": ({"axes": {"gamma": []}}, r"key 'axes.gamma': expected at least one value, found none"),
+    "empty named settings": ({"axes": {"m": {}}}, r"key 'axes.m': expected at least one value"),
+    "wrong type of axis": ({"axes": {"gamma": 0.9}}, r"key 'axes.gamma': expected a list of values, .* found 0.9"),
+    "wrong type of value": ({"axes": {"gamma": ["much"]}}, r"at gamma much: key 'gamma': expected a valid number"),
+    "wrong sense": ({"axes": {"sigma": [0.5, -1.0]}}, r"at sigma -1.0: key 'sigma': expected greater than 0"),
+    "not a number": ({"axes": {"sigma": [float("nan")]}}, r"key 'sigma': expected a finite number"),
+    "a fraction of a count": ({"axes": {"lanes": [8, 8.5]}}, r"at lanes 8.5: key 'lanes'"),
+    "wrong sense in the task": ({"axes": {"task.rod.mass_kg": [-1.0]}}, r"key 'rod.mass_kg': expected greater than 0"),
+    "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"judged is the same for all points"),
+    "duplicate values": ({"axes": {"gamma": [0.9, 0.9]}}, r"expected each point once, found gamma 0.9 and gamma 0.9"),
+    "duplicate by another way": ({"axes": {"lanes": [16, 16.0]}}, r"each point once, found lanes 16.0 and lanes 16"),
+    "called like a column": (
+        {"axes": {"seeds": {"a": {"gamma": 0.9}}}},
+        r"key 'axes.seeds': expected another name than that of a column of results.csv, found 'seeds'",
+    ),
+    "called like a measure": ({"axes": {"rms_angle_rad": {"a": {"gamma": 0.9}}}}, r"another name than .* 'rms_angle"),
+    "an axis without a name": ({"axes": {"": {"a": {"gamma": 0.9}}}}, r"expected a name for the axis, found \"\""),
+    "settings without a name": ({"axes": {"m": {"": {"gamma": 0.9}}}}, r"'axes.m': expected a name for each of its"),
+    "too large for single precision": (
+        {"axes": {"sigma": [0.5, 1e300]}},
+        r"at sigma 1e\+300: key 'sigma': expected a magnitude that single precision holds",
+    ),
+    "too small for single precision": ({"axes": {"xi": [1e-60]}}, r"at xi 1e-60: key 'xi': .* single precision holds"),
+    "the same in single precision": (
+        {"axes": {"gamma": [0.9, 0.900000001]}},
+        r"each point once, found gamma 0.900000001 and gamma 0.9, the same in single precision",
+    ),
+    "another period": (
+        {"axes": {"task.control_period_s": [0.05, 0.02]}},
+        r"judged alike, found another control period of its flights at task.control_period_s 0.05 and at",
+    ),
+    "returns of other lengths": (
+        {"axes": {"task.episode_steps": [200, 100]}},
+        r"judged alike, found another number of steps of its return at task.episode_steps 200 and at",
+    ),
+    "flights of other lengths": (
+        {"task": "inverted_pendulum", "axes": {"episode_steps": [200, 100]}},
+        r"judged alike, found another length of a flight \(episode_steps\) at episode_steps 200 and at",
+    ),
+    "other starts": (
+        {"axes": {"report_flights": [10, 20]}},
+        r"judged alike, found another number of flights",
+    ),
+    "fixed and axis": ({"axes": GAMMA, "fixed": {"gamma": 0.9}}, r"'axes.gamma': 'gamma' is set in 'fixed' too"),
+    "two axes": ({"axes": {**GAMMA, "m": {"a": {"gamma": 0.5}}}}, r"'gamma' is set in 'axes.gamma' too"),
+    "range upside down": (
+        {"axes": {"gamma": {"from": 0.9, "to": 0.5, "count": 3}}},
+        r"axes.gamma: expected from < to, found 0.9 and 0.5",
+    ),
+    "log of zero": (
+        {"axes": {"gamma": {"from": 0, "to": 0.5, "count": 3, "spacing": "log"}}},
+        r"expected from > 0 with log spacing",
+    ),
+    "a range without count": ({"axes": {"gamma": {"from": 0.5, "to": 0.9}}}, r"expected a count, or else 'sample'"),
+    "a sample with count": (
+        {"axes": {"gamma": {"from": 0.5, "to": 0.9, "count": 3}}, "sample": {"count": 2}},
+        r"expected no count where points are sampled",
+    ),
+    "more samples than points": (
+        {"axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 3}},
+        r"key 'sample.count': .* found 3; 2 different",
+    ),
+    "seeds twice": ({"axes": GAMMA, "seeds": [1, 1]}, r"key 'seeds': expected each seed once"),
+    "no seeds": ({"axes": GAMMA, "seeds": 0}, r"key 'seeds'"),
+    "seeds of a wrong type": ({"axes": GAMMA, "seeds": "four"}, r"key 'seeds': expected .* found \"four\""),
+    "too large": (
+        {"axes": {name: {"from": 0.1, "to": 0.9, "count": 1000} for name in ("gamma", "lam", "sigma")}},
+        r"fits into 1 GB of memory, found 1,000,000,000 points × 1 seeds, which need 95,000.0 GB",
+    ),
+    "a range too long to be listed": (
+        {"axes": {"gamma": {"from": 0.1, "to": 0.9, "count": 2_000_000_000}}},
+        r"found 2,000,000,000 points × 1 seeds, which need 190,000.0 GB",
+    ),
+    "too many seeds": ({"axes": GAMMA, "seeds": 1_000_000}, r"found 2 points × 1,000,000 seeds, which need 150.0 GB"),
+}
+
+
+@pytest.mark.parametrize(("data", "words"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_grids_are_refused_in_a_line(tmp_path: Path, data: dict, words: str) -> None:
+    with pytest.raises(BadInput, match=words) as refused:
+        load(tmp_path, {"task": "pendulum", **data})
+    assert "\n" not in str(refused.value)
+    assert str(refused.value).startswith(str(tmp_path / "grid.json"))
+
+
+def test_a_sample_that_its_axes_cannot_fill_is_refused_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once nothing new has come for long, however many were asked for."""
+    drawn, draw = [], Axis.draw
+    monkeypatch.setattr(Axis, "draw", lambda self, rng: drawn.append(1) or draw(self, rng))
+    with pytest.raises(BadInput, match=r"found 9,000; 2 different ones were drawn"):
+        load(tmp_path, {"task": "pendulum", "axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 9000}})
+    assert len(drawn) < 2000
