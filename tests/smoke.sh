@@ -11,8 +11,8 @@ unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS OUT RESUME CONFIG ARGS RUN GRID
 
 qrl=.venv/bin/qrl
 python=.venv/bin/python
-budget="--steps 1e5 --reports 3 --report-flights 10" # a little beyond the warm-up
-long="--steps 4e5 --reports 20 --report-flights 10"  # long enough to be interrupted after the first report
+budget="--num-timesteps 1e5 --num-evals 3 --num-eval-envs 10" # a little beyond the warm-up
+long="--num-timesteps 4e5 --num-evals 20 --num-eval-envs 10"  # long enough to be interrupted after the first report
 vehicle=experiments/vehicles/crazyflie.json
 
 work=$(mktemp -d)
@@ -134,7 +134,7 @@ pendulum_and_hover() {
 
 sweep_pendulum() {
   cat >"$work/grid.json" <<'JSON'
-{"task": "pendulum", "fixed": {"steps": 2e4, "reports": 2, "report_flights": 10},
+{"task": "pendulum", "fixed": {"steps": 2e4, "reports": 2, "num_eval_envs": 10},
  "axes": {"learning_rate": {"from": 1e-3, "to": 1e-2, "count": 2, "spacing": "log"}, "task.rod.mass_kg": [1, 1.5]},
  "seeds": 2}
 JSON
@@ -160,8 +160,8 @@ bad_input() {
   refuses "make view without RUN" "RUN is missing" make view
   refuses "to view a run that is not there" "nowhere" "$qrl" view "$out/nowhere"
   refuses "a misspelt task" "'hover'" "$qrl" train hoverr --out "$out/no"
-  refuses "a misspelt flag" "--stepz.*--steps" "$qrl" train hover --stepz 10 --out "$out/no"
-  refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --steps many --out "$out/no"
+  refuses "a misspelt flag" "--stepz.*--num-timesteps" "$qrl" train hover --num-timestepz 10 --out "$out/no"
+  refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --num-timesteps many --out "$out/no"
   refuses "a run that is not there" "nowhere" "$qrl" evaluate "$out/nowhere"
   refuses "to export a run that is not there" "nowhere" "$qrl" export "$out/nowhere"
 

@@ -41,7 +41,9 @@ def _single(value: float) -> float:
 Real = Annotated[float, AfterValidator(_single)]
 Positive = Annotated[float, Field(gt=0), AfterValidator(_single)]
 NonNegative = Annotated[float, Field(ge=0), AfterValidator(_single)]
+Fraction = Annotated[float, Field(ge=0, le=1), AfterValidator(_single)]
 Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, lt=2**31)]  # accepts 2e6
+CountOrZero = Annotated[int, BeforeValidator(_whole), Field(ge=0, lt=2**31)]
 
 T = TypeVar("T")
 

@@ -20,8 +20,8 @@ from qrl.config import load_preset
 def first_report(task: str, seed: int, out: Path, cache: Path) -> float:
     """Seconds until the command's first line that begins with a number of steps."""
     config = load_preset(task)
-    steps = config["warmup_unrolls"] * config["lanes"] * config["unroll_steps"]
-    words = ["train", task, "--seed", str(seed), "--steps", str(steps), "--reports", "1", "--out", str(out)]
+    steps = config["warmup_unrolls"] * config["num_envs"] * config["unroll_length"]
+    words = ["train", task, "--seed", str(seed), "--num-timesteps", str(steps), "--num-evals", "1", "--out", str(out)]
     env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "PYTHONUNBUFFERED": "1"}
     begun = time.time()
     command = [sys.executable, "-m", "qrl", *words]

@@ -34,7 +34,7 @@ def contestant(
     run = request.run_config(task, None, record.ConfigFile(learner=load_preset(name)), flags, seed, 1)
     devices.use_cores(run, [])
     env = tasks.environment(run.task)
-    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.logical_shards))
+    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.shard_count))
     return trainer, stack([point(env, run.learner)]), run
 
 
@@ -66,15 +66,17 @@ def main() -> None:
     judge.hear_jax().start()
     states = trainer.init(driver.seeds(run.seed, 1), points)
     advance, climb = driver.compile_advance(trainer, states, points), driver.compile_climb(trainer, states, points)
-    pieces = min(args.checks, config.unrolls)
-    for until in sorted({round(config.unrolls * (i + 1) / pieces) for i in range(pieces)} | {config.learning_unrolls}):
+    pieces = min(args.checks, config.num_unrolls)
+    for until in sorted(
+        {round(config.num_unrolls * (i + 1) / pieces) for i in range(pieces)} | {config.learning_unrolls}
+    ):
         on = advance if until <= config.learning_unrolls else climb
         states = jax.block_until_ready(on(states, points, np.int32(until)))
         learners = states.learner
         policy = (
             judged(jax.tree.map(lambda x: x[0], trainer.on_host(learners))) if args.task == "pendulum" else learners
         )
-        if judge.check(until * config.unroll_size, policy):
+        if judge.check(until * config.steps_per_unroll, policy):
             break
 
 

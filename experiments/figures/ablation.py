@@ -112,7 +112,7 @@ def page(found: dict[str, dict[str, Row]]) -> str:
     lines += ["", *(f"- *{name}*: {ROWS[name]}." for name in names), ""]
     for task in found:
         file = json.loads(grid(task).read_text())
-        steps = file["fixed"].get("steps") or load_preset(task)["steps"]
+        steps = file["fixed"].get("num_timesteps") or load_preset(task)["num_timesteps"]
         lines.append(
             f"{task}: {steps:,} steps, {file['seeds']} seeds, `qrl sweep experiments/{grid(task).name}`, flown from"
             " the starts of a run's reports after the last step."

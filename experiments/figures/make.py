@@ -122,7 +122,7 @@ def drawn(name: str, sources: list[Source], fly: "functools._lru_cache_wrapper[F
         return draw.hover(found), captions.hover(found)
     if name == "circle":
         found, config = curves(sources[0]), tasks.load_run_config(first)
-        longest = episode_steps(tasks.environment(config.task), config.learner.episode_steps)
+        longest = episode_steps(tasks.environment(config.task), config.learner.episode_length)
         return draw.circle(found), captions.circle(found, longest)
     if name == "hover_trial":
         flights = fly(first, trial=True)

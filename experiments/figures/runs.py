@@ -23,7 +23,7 @@ TRAINING = ("qrl.training.driver", "qrl_envs.env")  # what they import, and they
 CODE = "code.sha256"  # in a run's folder: of which code it is
 
 SEEDS, FAST_SEEDS = 6, 2  # even, so that two cores share them
-PPO = {"ring_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
+PPO = {"replay_unrolls": 1, "warmup_unrolls": 1, "advantage": "mu", "lam": 0.95}
 PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
 METHOD = {"apg_fraction": 0.0}  # the paper's method to the end, on trajectories that symmetries turn
 RATIO = PAPER_RATES["high"] / PAPER_RATES["low"]
@@ -63,14 +63,14 @@ def wanted(*, fast: bool) -> list[Wanted]:
         return [
             *found,
             Wanted("hover", "hover", "hover_fast", METHOD, seeds),
-            Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 1_200_000}, seeds),
+            Wanted("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 1_200_000}, seeds),
         ]
     return [
         *found,
-        Wanted("hover", "hover", "hover", METHOD | {"steps": 1_500_000, "reports": 25}, seeds),
-        Wanted("circle", "circle", "circle_fast", METHOD | {"steps": 2_400_000, "reports": 20}, seeds),
-        Wanted("hover-flight", "hover", "hover", METHOD | {"steps": 4_500_000}),
-        Wanted("circle-flight", "circle", "circle", METHOD | {"steps": 4_500_000}),
+        Wanted("hover", "hover", "hover", METHOD | {"num_timesteps": 1_500_000, "num_evals": 25}, seeds),
+        Wanted("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 2_400_000, "num_evals": 20}, seeds),
+        Wanted("hover-flight", "hover", "hover", METHOD | {"num_timesteps": 4_500_000}),
+        Wanted("circle-flight", "circle", "circle", METHOD | {"num_timesteps": 4_500_000}),
     ]
 
 

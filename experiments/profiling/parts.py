@@ -52,9 +52,9 @@ class Part(NamedTuple):
 def now_of(trainer: Trainer, states: TrainState, points: Point) -> Now:
     """Copies of what the parts need of a run of one member: the run may go on, and donate its states."""
     one, here = jax.tree.map(lambda x: jnp.array(x[0]), (states, points))
-    shards = trainer.config.logical_shards
+    shards = trainer.config.shard_count
     keys = jax.random.split(jax.random.PRNGKey(0), shards)
-    index = replay_buffer.draw(one.ring, keys, REPEATED, trainer.config.minibatch_lanes // shards)
+    index = replay_buffer.draw(one.ring, keys, REPEATED, trainer.config.batch_size // shards)
     return Now(one, here, index, trainer._turns(keys, index), replay_buffer.gather(one.ring, index[0]))
 
 
@@ -73,7 +73,10 @@ def slightly(tree: Any, tiny: chex.Array) -> Any:
 def pass_adds(trainer: Trainer) -> tuple[int, int]:
     """Multiply-adds of one pass of the policy, and of the critic."""
     config, inputs = trainer.config, trainer.learner.observation_size
-    policy, critic = [inputs, *config.policy_hidden, trainer.env.action_size], [inputs, *config.critic_hidden, 1]
+    policy, critic = (
+        [inputs, *config.policy_hidden_layer_sizes, trainer.env.action_size],
+        [inputs, *config.critic_hidden_layer_sizes, 1],
+    )
     return layers(policy), layers(critic)
 
 
@@ -85,7 +88,7 @@ def layers(sizes: list[int]) -> int:
 
 
 def acting_parts(trainer: Trainer, now: Now) -> list[Part]:
-    adds = pass_adds(trainer)[0] * trainer.config.unroll_size
+    adds = pass_adds(trainer)[0] * trainer.config.steps_per_unroll
     slot = jax.tree.map(lambda x: x[0], now.state.ring.data)
     return [
         Part("acting", acted, adds=adds, first=(now.state.lanes, slot)),
@@ -104,7 +107,7 @@ def acted(trainer: Trainer, turn: Turn) -> Any:
 
 def unrolled(trainer: Trainer, now: Now) -> Any:
     """The newest unroll's observations and actions, [T, N, ...]."""
-    newest = (now.state.ring.inserted - 1) % trainer.config.ring_unrolls
+    newest = (now.state.ring.inserted - 1) % trainer.config.replay_unrolls
     data: Any = now.state.ring.data
     return [jnp.swapaxes(x[newest], 0, 1) for x in (data.observation, data.action)]
 
@@ -116,7 +119,7 @@ def policy_alone(trainer: Trainer, turn: Turn) -> Any:
 
 
 def noise(trainer: Trainer, turn: Turn) -> Any:
-    key, shape = jax.random.fold_in(turn.now.state.key, turn.i), (trainer.config.unroll_steps, trainer.env.action_size)
+    key, shape = jax.random.fold_in(turn.now.state.key, turn.i), (trainer.config.unroll_length, trainer.env.action_size)
     return jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), shape))(turn.now.state.lanes.number)
 
 
@@ -129,7 +132,7 @@ def physics(trainer: Trainer, turn: Turn) -> Any:
 
 
 def starts(trainer: Trainer, turn: Turn) -> Any:
-    over, lanes = jnp.ones(trainer.config.lanes, bool), turn.now.state.lanes
+    over, lanes = jnp.ones(trainer.config.num_envs, bool), turn.now.state.lanes
     lanes = lanes._replace(ended=over, used=over, start=lanes.start + turn.i)
     return rollout._restart(trainer.env, lanes, turn.now.state.starts)
 
@@ -154,9 +157,9 @@ def inserted(trainer: Trainer, turn: Turn) -> Any:
 
 def drawn(trainer: Trainer, turn: Turn) -> Any:
     config, state = trainer.config, turn.now.state
-    shards = config.logical_shards
+    shards = config.shard_count
     keys = jax.vmap(lambda shard: jax.random.fold_in(jax.random.fold_in(state.key, turn.i), shard))(jnp.arange(shards))
-    index = replay_buffer.draw(state.ring, keys, config.updates_per_unroll, config.minibatch_lanes // shards)
+    index = replay_buffer.draw(state.ring, keys, config.updates_per_unroll, config.batch_size // shards)
     return index, trainer._turns(keys, index)
 
 
@@ -177,7 +180,9 @@ def update_parts(trainer: Trainer, now: Now) -> list[Part]:
     updates, size = config.updates_per_unroll, now.batch.reward.size
     policy, critic = pass_adds(trainer)
     # Backwards: as much again for the weights, and for the inputs of all layers but the first.
-    backwards = 2 * (policy + critic) - learner.observation_size * (config.policy_hidden[0] + config.critic_hidden[0])
+    backwards = 2 * (policy + critic) - learner.observation_size * (
+        config.policy_hidden_layer_sizes[0] + config.critic_hidden_layer_sizes[0]
+    )
     terms = jax.eval_shape(learner.update, state, now.batch)[1]
     no_terms = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), terms)
     step = [(p, o, jnp.float32(0.0)) for p, o in zip(state.params, state.optimiser, strict=True)]

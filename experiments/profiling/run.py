@@ -35,7 +35,7 @@ def begun(task: str) -> tuple[Trainer, Point, TrainState, Callable[..., TrainSta
     trainer, points = Trainer(env, config), stack([point(env, config)])
     states = trainer.init(driver.seeds(0, 1), points)
     advance = driver.compile_advance(trainer, states, points)
-    states = advance(states, points, np.int32(min(config.unrolls, 2 * config.ring_unrolls)))
+    states = advance(states, points, np.int32(min(config.num_unrolls, 2 * config.replay_unrolls)))
     return trainer, points, jax.block_until_ready(states), advance
 
 
@@ -131,7 +131,7 @@ def main() -> None:
         f"{jax.devices()[0].device_kind}, jax {jax.__version__}; {2e-9 * rate:.0f} GFLOP/s in [1600, 64] x [64, 64]\n"
     )
     table(rows, took, rate)
-    print(f"\n{trainer.config.unroll_size / took['whole']:,.0f} env steps/s")
+    print(f"\n{trainer.config.steps_per_unroll / took['whole']:,.0f} env steps/s")
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path("experiments/out/soak"))
     args = parser.parse_args()
     reports = max(4, round(args.steps / REPORT_STEPS))
-    long = {"steps": args.steps, "reports": reports, "apg_fraction": 0.0}
+    long = {"num_timesteps": args.steps, "num_evals": reports, "apg_fraction": 0.0}
     run = request.run_config("hover", None, record.ConfigFile(), long, 0, 1)
     devices.use_cores(run, [])
     if args.out.exists():

@@ -47,13 +47,13 @@ TRAINING_LANES = 512
 def hover(**learner: Any) -> record.RunConfig:
     """Hover with the default networks and these hyperparameters."""
     file = record.ConfigFile(
-        learner=load_preset("hover") | {"unroll_steps": UNROLL_STEPS, "apg_fraction": 0.0} | learner
+        learner=load_preset("hover") | {"unroll_length": UNROLL_STEPS, "apg_fraction": 0.0} | learner
     )
     return request.run_config("hover", None, file, {}, 0, 1)
 
 
 def acting(lanes: int, key: jax.Array) -> None:
-    trainer, states, points = begun(hover(lanes=lanes, ring_unrolls=1))
+    trainer, states, points = begun(hover(num_envs=lanes, replay_unrolls=1))
     unrolls = max(1, LANES[-1] // lanes)  # as many steps in each call, which takes time of its own
 
     def act(members: Any, carry: Any, key: Any) -> Any:
@@ -85,7 +85,7 @@ def physics(lanes: int, key: jax.Array) -> None:
     env = worlds.make("hover")
     params: Any = env.params
     dt_s = env.task.control_period_s
-    mesh = spread(jax.devices(), 1, hover(lanes=lanes).learner.logical_shards)
+    mesh = spread(jax.devices(), 1, hover(num_envs=lanes).learner.shard_count)
     blocks = max(mesh.size if mesh else 1, lanes // rollout.BLOCK_LANES)
     unrolls = max(1, LANES[-1] // lanes)
 
@@ -109,32 +109,32 @@ def physics(lanes: int, key: jax.Array) -> None:
     rate(f"physics, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
 
 
-def learning(minibatch_lanes: int, key: jax.Array) -> None:
+def learning(batch_size: int, key: jax.Array) -> None:
     updates = 128
-    run = hover(minibatch_lanes=minibatch_lanes, updates_per_unroll=updates, warmup_unrolls=1, steps=10**9)
-    samples = updates * minibatch_lanes * UNROLL_STEPS
-    advancing(f"learning, {minibatch_lanes * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
+    run = hover(batch_size=batch_size, updates_per_unroll=updates, warmup_unrolls=1, num_timesteps=10**9)
+    samples = updates * batch_size * UNROLL_STEPS
+    advancing(f"learning, {batch_size * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
 
 
-def training(unroll_steps: int, key: jax.Array) -> None:
+def training(unroll_length: int, key: jax.Array) -> None:
     run = hover(
-        lanes=TRAINING_LANES,
-        unroll_steps=unroll_steps,
-        steps=10**9,
-        ring_unrolls=1,
+        num_envs=TRAINING_LANES,
+        unroll_length=unroll_length,
+        num_timesteps=10**9,
+        replay_unrolls=1,
         warmup_unrolls=1,
         updates_per_unroll=BRAX_MINIBATCHES * BRAX_PASSES,
-        minibatch_lanes=TRAINING_LANES // BRAX_MINIBATCHES,
+        batch_size=TRAINING_LANES // BRAX_MINIBATCHES,
     )
-    unrolls = 200 // unroll_steps
-    advancing(TRAINING[unroll_steps], run, unrolls, unrolls * run.learner.unroll_size)
+    unrolls = 200 // unroll_length
+    advancing(TRAINING[unroll_length], run, unrolls, unrolls * run.learner.steps_per_unroll)
 
 
 def advancing(figure: str, run: record.RunConfig, unrolls: int, counted: int) -> None:
     """How much of what is `counted` in so many unrolls the training loop does."""
     trainer, states, points = begun(run)
     advance = driver.compile_advance(trainer, states, points)
-    full = run.learner.ring_unrolls
+    full = run.learner.replay_unrolls
     states = advance(states, points, np.int32(full))
 
     def on(carry: Any) -> Any:
@@ -146,7 +146,7 @@ def advancing(figure: str, run: record.RunConfig, unrolls: int, counted: int) ->
 
 def begun(run: record.RunConfig) -> tuple[Trainer, Any, Any]:
     env = tasks.environment(run.task)
-    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.logical_shards))
+    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.shard_count))
     points = stack([point(env, run.learner)])
     return trainer, trainer.init(driver.seeds(0, 1), points), points
 

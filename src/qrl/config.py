@@ -1,180 +1,221 @@
-"""The learner's hyperparameters: declared once here, valued in presets/*.json (paper's symbols, FIELD's terms).
+"""Hyperparameters of the learner: declared once here, valued in presets/*.json.
 
-Each is declared `Traced` or `Static`. Traced ones reach the compiled program as its arguments, so that runs that
-differ in them alone share one program; static ones (shapes, counts, choices, whether an optional one is there at all)
-shape the program.
+Each is `Traced` or `Static`. A traced one reaches the compiled program as an argument (`Hyperparameters`), so runs that
+differ in traced ones alone share one program. A static one (shape, count, choice, presence) shapes the program.
+Symbols are the paper's; names are those of Brax and Stable-Baselines3 where they have one.
 """
 
 import json
 import math
+from collections.abc import Mapping
 from importlib import resources
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-
-def _whole(value: Any) -> Any:
-    return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def _single(value: float) -> float:
-    if value and not 1e-30 <= abs(value) <= 1e30:
-        raise ValueError(f"expected a magnitude that single precision holds (1e-30 to 1e30), found {value}")
-    return value
-
-
-Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, lt=2**31)]  # accepts 2e6
-CountOrZero = Annotated[int, BeforeValidator(_whole), Field(ge=0, lt=2**31)]
-Positive = Annotated[float, Field(gt=0), AfterValidator(_single)]
-NonNegative = Annotated[float, Field(ge=0), AfterValidator(_single)]
-Fraction = Annotated[float, Field(ge=0, le=1), AfterValidator(_single)]
+from qrl_envs.specfile import BadInput, Count, Fraction, NonNegative, Positive, nearest
 
 T = TypeVar("T")
 Traced = Annotated[T, "traced"]
 Static = Annotated[T, "static"]
 
+# Names of the first version, still read from files and flags. To be removed in 0.3.
+FORMER_NAMES = {
+    "steps": "num_timesteps",
+    "episode_steps": "episode_length",
+    "lanes": "num_envs",
+    "unroll_steps": "unroll_length",
+    "ring_unrolls": "replay_unrolls",
+    "minibatch_lanes": "batch_size",
+    "shards": "num_shards",
+    "policy_hidden": "policy_hidden_layer_sizes",
+    "critic_hidden": "critic_hidden_layer_sizes",
+    "normalise_observations": "normalize_observations",
+    "normalise_advantage": "normalize_advantage",
+    "reward_scale": "reward_scaling",
+    "gradient_clip": "max_grad_norm",
+    "apg_lanes": "apg_num_envs",
+    "apg_steps": "apg_episode_length",
+    "reports": "num_evals",
+    "report_flights": "num_eval_envs",
+}
+
+
+class Hyperparameters(NamedTuple):
+    """The traced hyperparameters as arrays: float32 [], `observation_scale` [F]; None where there is none."""
+
+    observation_scale: Any
+    reward_scaling: Any
+    learning_rate: Any
+    learning_rate_end: Any
+    max_grad_norm: Any
+    sigma: Any
+    sigma_end: Any
+    apg_learning_rate: Any
+    gamma: Any
+    lam: Any
+    rho_bar: Any
+    c_bar: Any
+    epsilon: Any
+    xi: Any
+
 
 class Config(BaseModel):
-    """Everything that the learner may be told. The defaults are src/qrl/presets/default.json."""
+    """All hyperparameters of the learner. Defaults: presets/default.json."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
-    steps: Static[Count] = Field(description="environment steps in all")
-    episode_steps: Static[Count | None] = Field(description="longest training episode; null: the task's own")
-    lanes: Static[Count] = Field(description="environments stepped side by side")
-    unroll_steps: Static[Count] = Field(description="T: steps of one unroll, the trajectory length of Algorithm 2")
-    ring_unrolls: Static[Count] = Field(description="slots of the ring buffer, each one unroll of all lanes")
-    warmup_unrolls: Static[Count] = Field(description="unrolls collected before learning starts")
+    num_timesteps: Static[Count] = Field(description="environment steps of the run, APG flights included")
+    episode_length: Static[Count | None] = Field(description="maximum steps of a training episode; null: the task's")
+    num_envs: Static[Count] = Field(description="environments stepped in parallel (lanes)")
+    unroll_length: Static[Count] = Field(description="T: steps of one unroll, the trajectory length of Algorithm 2")
+    replay_unrolls: Static[Count] = Field(description="capacity of the replay buffer, in unrolls of all environments")
+    warmup_unrolls: Static[Count] = Field(description="unrolls collected before the first update")
     updates_per_unroll: Static[Count] = Field(description="minibatch updates after each unroll")
-    minibatch_lanes: Static[Count] = Field(description="trajectories (slot, lane) of one minibatch")
-    shards: Static[Count | None] = Field(
-        description="equal shares of lanes and minibatch: devices must divide them, and results are the same on any"
-        " number that does; null: 8, or as many as lanes and minibatch_lanes allow"
+    batch_size: Static[Count] = Field(description="trajectories of unroll_length steps in a minibatch")
+    num_shards: Static[Count | None] = Field(
+        description="equal shares of environments and minibatch; results are the same on any number of devices that"
+        " divides it; null: 8, or the largest that num_envs and batch_size allow"
     )
 
     symmetries: Static[bool] = Field(
-        description="turn each trajectory of a minibatch by a random symmetry of the task, where it has some"
+        description="transform each trajectory of a minibatch by a random symmetry of the task (data augmentation)"
     )
 
-    policy_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the policy")
-    critic_hidden: Static[tuple[Count, ...]] = Field(description="hidden layers of the critic")
+    policy_hidden_layer_sizes: Static[tuple[Count, ...]] = Field(description="hidden layers of the policy network")
+    critic_hidden_layer_sizes: Static[tuple[Count, ...]] = Field(description="hidden layers of the value network")
     activation: Static[Literal["relu", "tanh"]] = Field(description="activation of both networks")
     observation_scale: Traced[tuple[Positive, ...] | None] = Field(
         description="factor on each observation before the networks; null: 1"
     )
-    normalise_observations: Static[bool] = Field(
-        description="standardise observations by their running mean and deviation"
+    normalize_observations: Static[bool] = Field(
+        description="standardize observations by their running mean and deviation"
     )
-    reward_scale: Traced[Positive] = Field(description="factor on rewards, so that |V| is about 1")
+    reward_scaling: Traced[Positive] = Field(description="factor on rewards; choose it such that |V| is about 1")
 
-    learning_rate: Traced[Positive] = Field(description="Adam's step size at the start of learning")
-    learning_rate_end: Traced[NonNegative] = Field(description="and at its end, linear in between")
-    gradient_clip: Traced[Positive] = Field(description="global norm at which each network's gradient is clipped")
-    sigma: Traced[Positive] = Field(description="the policy's standard deviation at the start")
-    sigma_end: Traced[Positive] = Field(description="and at the end of learning, log-linear in between")
+    learning_rate: Traced[Positive] = Field(description="initial step size of Adam")
+    learning_rate_end: Traced[NonNegative] = Field(description="final step size of the linear schedule")
+    max_grad_norm: Traced[Positive] = Field(description="global norm at which each network's gradient is clipped")
+    sigma: Traced[Positive] = Field(description="initial standard deviation of the policy")
+    sigma_end: Traced[Positive] = Field(description="final standard deviation of the log-linear schedule")
     average_fraction: Static[Fraction] = Field(
-        description="last part of learning over which the policy that ships is averaged; 0: not averaged"
+        description="last fraction of learning over which the deployed policy's parameters are averaged; 0: no average"
     )
 
     apg_fraction: Static[Fraction] = Field(
-        description="last part of the run's steps, in which the policy climbs the gradient of whole flights through the"
-        " environment itself (analytic policy gradient); 0: none"
+        description="last fraction of num_timesteps spent on the analytic policy gradient (APG); 0: the paper's method"
+        " alone"
     )
-    apg_lanes: Static[Count] = Field(description="flights of one such update")
-    apg_steps: Static[Count] = Field(description="steps of each")
-    apg_learning_rate: Traced[Positive] = Field(description="Adam's step size at its start; this and sigma fall to 0")
+    apg_num_envs: Static[Count] = Field(description="flights of one APG update")
+    apg_episode_length: Static[Count] = Field(description="steps of one APG flight")
+    apg_learning_rate: Traced[Positive] = Field(description="initial step size of APG; decays to 0, as sigma then does")
 
     gamma: Traced[Fraction] = Field(description="discount")
-    lam: Traced[Fraction] = Field(description="lambda of the trace; 1 in the paper")
-    rho_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the temporal difference; 1 in the paper")
-    c_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the trace; 1 in the paper")
+    lam: Traced[Fraction] = Field(description="lambda of the trace; the paper has 1")
+    rho_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the temporal difference; the paper has 1")
+    c_bar: Traced[Positive] = Field(description="V-trace's clip of rho in the trace; the paper has 1")
     advantage: Static[Literal["pi", "mu"]] = Field(
         description="pi: A^pi by V-trace (conditions 3, 4); mu: A^mu by GAE(lambda) (conditions 1, 2)"
     )
     form: Static[Literal["ratio", "difference"]] = Field(
-        description="pi/mu − 1 (conditions 2, 4) or pi − mu (conditions 1, 3)"
+        description="ratio: pi/mu - 1 (conditions 2, 4); difference: pi - mu (conditions 1, 3)"
     )
-    epsilon: Traced[Positive] = Field(description="margin epsilon·|A|")
-    xi: Traced[Positive | None] = Field(description="constant margin in its stead; null: none")
-    normalise_advantage: Static[bool] = Field(description="divide A by its root mean square over the minibatch")
+    epsilon: Traced[Positive] = Field(description="margin epsilon·|A|, PPO's clip")
+    xi: Traced[Positive | None] = Field(description="constant margin, overrides epsilon; null: none")
+    normalize_advantage: Static[bool] = Field(description="divide A by its root mean square over the minibatch")
 
-    reports: Static[Count] = Field(description="reports of a run: each an evaluation and a checkpoint")
-    report_flights: Static[Count] = Field(description="fixed starts flown at each report")
+    num_evals: Static[Count] = Field(description="reports of a run: an evaluation and a checkpoint each")
+    num_eval_envs: Static[Count] = Field(description="fixed starts flown at each report")
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
         if self.warmup_unrolls > self.learning_unrolls:
-            least, found = (n * self.unroll_size for n in (self.warmup_unrolls, self.learning_unrolls))
-            before = " before the analytic gradient" if self.climbs else ""
+            least, found = (n * self.steps_per_unroll for n in (self.warmup_unrolls, self.learning_unrolls))
+            before = " before APG" if self.num_apg_updates else ""
             raise ValueError(
-                f"expected steps of at least warmup_unrolls · lanes · unroll_steps = {least:,}{before}, found {found:,}"
+                f"expected num_timesteps of at least warmup_unrolls · num_envs · unroll_length = {least:,}{before},"
+                f" found {found:,}"
             )
-        for name in ("lanes", "minibatch_lanes", *(["apg_lanes"] if self.climbs else [])):
-            if (value := getattr(self, name)) % self.logical_shards:
-                raise ValueError(f"expected {name} to be a multiple of shards = {self.logical_shards}, found {value}")
+        for name in ("num_envs", "batch_size", *(["apg_num_envs"] if self.num_apg_updates else [])):
+            if (value := getattr(self, name)) % self.shard_count:
+                raise ValueError(f"expected {name} to be a multiple of num_shards = {self.shard_count}, found {value}")
         return self
 
-    @property
-    def logical_shards(self) -> int:
-        return self.shards or math.gcd(8, self.lanes, self.minibatch_lanes)
+    @classmethod
+    def preset(cls, name: str) -> "Config":
+        """The preset of that name; BadInput if there is none."""
+        return cls.model_validate_json(json.dumps(load_preset(name)))
 
     @property
-    def traced(self) -> dict[str, Any]:
-        """The traced hyperparameters that are there (not null)."""
-        return {name: value for name in TRACED if (value := getattr(self, name)) is not None}
+    def hyperparameters(self) -> Hyperparameters:
+        """The traced hyperparameters as NumPy arrays."""
+        values = {name: getattr(self, name) for name in Hyperparameters._fields}
+        return Hyperparameters(**{k: None if v is None else np.asarray(v, np.float32) for k, v in values.items()})
 
     @property
     def static(self) -> dict[str, Any]:
-        """What must be the same for two runs to share one compiled program, plain enough for JSON."""
-        shapes = {name: len(value) if isinstance(value, tuple) else 1 for name, value in self.traced.items()}
-        return {**self.model_dump(mode="json", exclude=set(TRACED)), "traced": shapes}
+        """What two runs must share to share a compiled program, as JSON values."""
+        shapes = {name: x.shape for name, x in self.hyperparameters._asdict().items() if x is not None}
+        return {**self.model_dump(mode="json", exclude=set(Hyperparameters._fields)), "traced": shapes}
 
     @property
-    def unroll_size(self) -> int:
-        """Environment steps in one unroll of all lanes."""
-        return self.lanes * self.unroll_steps
+    def shard_count(self) -> int:
+        return self.num_shards or math.gcd(8, self.num_envs, self.batch_size)
 
     @property
-    def unrolls(self) -> int:
-        """Unrolls in the whole run; never more steps than `steps`."""
-        return self.steps // self.unroll_size
+    def steps_per_unroll(self) -> int:
+        """Environment steps of one unroll of all environments."""
+        return self.num_envs * self.unroll_length
 
     @property
-    def unrolls_per_climb(self) -> int:
-        """What the flights of one update by the analytic gradient take of the run's steps."""
-        return -(-self.apg_lanes * self.apg_steps // self.unroll_size)
+    def num_unrolls(self) -> int:
+        """Unrolls of the run; never more steps than `num_timesteps`."""
+        return self.num_timesteps // self.steps_per_unroll
 
     @property
-    def climbs(self) -> int:
-        """Updates by the analytic gradient, at the run's end."""
-        return int(self.unrolls * self.apg_fraction) // self.unrolls_per_climb
+    def unrolls_per_apg_update(self) -> int:
+        """Unrolls that the flights of one APG update count for."""
+        return -(-self.apg_num_envs * self.apg_episode_length // self.steps_per_unroll)
+
+    @property
+    def num_apg_updates(self) -> int:
+        """APG updates at the end of the run."""
+        return int(self.num_unrolls * self.apg_fraction) // self.unrolls_per_apg_update
 
     @property
     def learning_unrolls(self) -> int:
-        """Unrolls that are made and learnt from; the rest of the run's steps are the climbs'."""
-        return self.unrolls - self.climbs * self.unrolls_per_climb
+        """Unrolls that are collected and learned from; the rest of the steps are those of APG."""
+        return self.num_unrolls - self.num_apg_updates * self.unrolls_per_apg_update
 
-    def work(self, first: int, last: int) -> float:
-        """What there is to do from `first` to `last` unrolls, in steps flown or learnt from."""
-        replayed = self.updates_per_unroll * self.minibatch_lanes / self.lanes
+    def estimated_cost(self, first: int, last: int) -> float:
+        """Work from `first` to `last` unrolls, in steps that are flown or learned from."""
+        replayed = self.updates_per_unroll * self.batch_size / self.num_envs
         learning = min(last, self.learning_unrolls) - min(first, self.learning_unrolls)
-        return self.unroll_size * ((last - first) + replayed * learning)
+        return self.steps_per_unroll * ((last - first) + replayed * learning)
 
-    def whole(self, unrolls: int) -> int:
-        """`unrolls`, or where it lies among the climbs, the end of the climb in which it lies."""
+    def align_to_apg_update(self, unrolls: int) -> int:
+        """`unrolls`, rounded up to the end of an APG update where it lies within one."""
         into = max(0, unrolls - self.learning_unrolls)
-        return unrolls + -into % self.unrolls_per_climb if into else unrolls
+        return unrolls + -into % self.unrolls_per_apg_update if into else unrolls
 
     @property
-    def unrolls_per_report(self) -> int:
-        return max(1, -(-self.unrolls // self.reports))
+    def unrolls_per_eval(self) -> int:
+        return max(1, -(-self.num_unrolls // self.num_evals))
 
 
-TRACED = tuple(name for name, field in Config.model_fields.items() if "traced" in field.metadata)
+def current_names(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """`values` with hyperparameters under today's names; BadInput, naming `where`, if one has both names."""
+    for former, name in FORMER_NAMES.items():
+        if former in values and name in values:
+            raise BadInput(f"{where}: key '{former}': is called '{name}' now, and both are given")
+    return {FORMER_NAMES.get(name, name): value for name, value in values.items()}
 
 
 def load_preset(name: str) -> dict[str, Any]:
-    """The learner's defaults laid under the preset `name` ("default" for a task without one of its own)."""
+    """Values of the preset `name` over those of "default"; BadInput if there is none of that name."""
+    if name not in preset_names():
+        raise BadInput(f"no preset '{name}'{nearest(name, preset_names())}")
     folder = resources.files("qrl").joinpath("presets")
     data = json.loads(folder.joinpath("default.json").read_text(encoding="utf-8"))
     if name != "default":

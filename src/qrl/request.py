@@ -5,7 +5,7 @@ from typing import Any
 
 from qrl import tasks
 from qrl.config import Config
-from qrl.runs import record as runs
+from qrl.runs import record as records
 from qrl.runs.record import ConfigFile, RunConfig, TaskRecord
 from qrl.training.devices import device_names
 from qrl_envs import specfile
@@ -17,7 +17,7 @@ def config_file(path: Path | None) -> ConfigFile:
     """What CONFIG holds, its task checked; nothing where there is no CONFIG."""
     if path is None:
         return ConfigFile()
-    file = specfile.build(ConfigFile, specfile.read(path), str(path))
+    file = specfile.build(ConfigFile, records.with_current_names(specfile.read(path), str(path)), str(path))
     record = file.task
     if isinstance(record, str):
         record = tasks.task_named(record, path)
@@ -47,7 +47,7 @@ def run_config(
         learner=_learner(record, task or str(config), config, file.learner, flags),
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
-        versions=runs.versions(),
+        versions=records.versions(),
         devices=[],
     )
     return tasks.check_seed_range(run, str(config or "command line"))
@@ -67,7 +67,7 @@ def _learner(
 
 def changed_since(run: RunConfig) -> str:
     """Which packages and devices are others than those that a run began with."""
-    now = runs.versions()
+    now = records.versions()
     names = sorted(run.versions.keys() | now.keys())
     changed = [
         f"{name} was {run.versions.get(name, 'none')}, is {now.get(name, 'none')}"

@@ -10,8 +10,8 @@ from typing import Any
 import jax
 
 from qrl.algorithm.types import Env
-from qrl.config import Config, load_preset, preset_names
-from qrl.runs.record import RunConfig, TaskRecord
+from qrl.config import Config, load_preset
+from qrl.runs.record import RunConfig, TaskRecord, with_current_names
 from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
@@ -80,9 +80,10 @@ def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
 
 def preset(name: str, where: str) -> dict[str, Any]:
     """The preset of that name, which `where` names: all of the learner's values."""
-    if name not in preset_names():
-        raise BadInput(f"{where}: no preset '{name}'{specfile.nearest(name, preset_names())}")
-    return load_preset(name)
+    try:
+        return load_preset(name)
+    except BadInput as error:
+        raise BadInput(f"{where}: {error}") from None
 
 
 def task_preset(record: TaskRecord, where: str) -> dict[str, Any]:
@@ -107,7 +108,7 @@ def check(env: Env, learner: Config, where: str) -> None:
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
     except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
         raise BadInput(f"{where}: this environment does not work with jax {jax.__version__}: {error}") from None
-    if learner.climbs and not hasattr(env, "evaluation"):  # ours are differentiable
+    if learner.num_apg_updates and not hasattr(env, "evaluation"):  # ours are differentiable
         try:
             jax.eval_shape(
                 jax.grad(lambda action: env.step(env.reset(jax.random.PRNGKey(0)), action).reward.sum()),
@@ -137,5 +138,5 @@ def load_run_config(folder: Path) -> RunConfig:
     path = folder / "config.json"
     if not path.exists():
         raise BadInput(f"{folder}: not a run folder (no config.json)")
-    run = specfile.build(RunConfig, specfile.read(path), str(path))
+    run = specfile.build(RunConfig, with_current_names(specfile.read(path), str(path)), str(path))
     return check_seed_range(run.model_copy(update={"task": check_task_record(run.task, str(path))}), str(path))

@@ -29,8 +29,8 @@ pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
 CLIMBING = {
     "apg_fraction": 0.4,
-    "apg_lanes": 4,
-    "apg_steps": 20,
+    "apg_num_envs": 4,
+    "apg_episode_length": 20,
 }  # 6, the last 12 of 30 unrolls
 
 
@@ -116,7 +116,11 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 
 
 def learner(**changes: object) -> Learner:
-    preset = load_preset("default") | {"normalise_observations": False, "policy_hidden": [8], "critic_hidden": [8]}
+    preset = load_preset("default") | {
+        "normalize_observations": False,
+        "policy_hidden_layer_sizes": [8],
+        "critic_hidden_layer_sizes": [8],
+    }
     return Learner(Config.model_validate(preset | {"apg_fraction": 0.5} | changes, strict=False), 2, 1)
 
 
@@ -138,7 +142,7 @@ def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
         state, _, _ = climb(state, i)
     state, _, sums = climb(state, 29)
     assert float(jnp.mean(flown(state)[0])) > 0.5 * float(jnp.mean(flown(first)[0]))  # both below 0
-    assert sums[1] == ours.config.apg_lanes
+    assert sums[1] == ours.config.apg_num_envs
     assert state.updates == 30
     jax.tree.map(np.testing.assert_array_equal, state.params.critic, first.params.critic)
     jax.tree.map(np.testing.assert_array_equal, state.optimiser.critic, first.optimiser.critic)
@@ -147,7 +151,7 @@ def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
 
 def test_the_first_climb_begins_with_what_ships_and_a_fresh_optimiser() -> None:
     """Adam's first step is the sign of the gradient, whatever it had seen before; the last one's size is near 0."""
-    ours = learner(average_fraction=0.5, gradient_clip=1e9)
+    ours = learner(average_fraction=0.5, max_grad_norm=1e9)
     state = ours.init(jax.random.PRNGKey(1))
     seen = jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimiser.policy)
     average = jax.tree.map(lambda x: x + 1.0, state.params.policy)
@@ -162,9 +166,9 @@ def test_the_first_climb_begins_with_what_ships_and_a_fresh_optimiser() -> None:
     ships = policy_of(state._replace(params=state.params._replace(policy=average)))
     np.testing.assert_allclose(policy_of(after) - ships, ours.config.apg_learning_rate, rtol=1e-3)
     np.testing.assert_allclose(terms.policy_gradient, 3.0 * np.sqrt(len(ships)), rtol=1e-5)
-    last, _, _ = ours.climb(after, flown, jnp.int32(ours.config.climbs - 1))
+    last, _, _ = ours.climb(after, flown, jnp.int32(ours.config.num_apg_updates - 1))
     moved = np.abs(policy_of(last) - policy_of(after)).max()
-    assert 0 < moved < 3.0 * ours.config.apg_learning_rate / ours.config.climbs
+    assert 0 < moved < 3.0 * ours.config.apg_learning_rate / ours.config.num_apg_updates
 
 
 def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
@@ -186,27 +190,32 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
     steps=st.integers(5_000, 200_000),
     lanes=st.sampled_from([8, 16, 64]),
     fraction=st.floats(0.01, 0.9),
-    apg_lanes=st.sampled_from([8, 40, 64]),
-    apg_steps=st.integers(1, 600),
+    apg_num_envs=st.sampled_from([8, 40, 64]),
+    apg_episode_length=st.integers(1, 600),
 )
 def test_a_run_is_learning_and_then_climbs(
-    steps: int, lanes: int, fraction: float, apg_lanes: int, apg_steps: int
+    steps: int, lanes: int, fraction: float, apg_num_envs: int, apg_episode_length: int
 ) -> None:
     """Together they make its unrolls; climbs take no more than their share, and no fewer steps than they fly."""
-    changes = {"apg_fraction": fraction, "apg_lanes": apg_lanes, "apg_steps": apg_steps, "warmup_unrolls": 1}
-    base = load_preset("default") | {"steps": steps, "lanes": lanes, "unroll_steps": 5, "minibatch_lanes": 8}
+    changes = {
+        "apg_fraction": fraction,
+        "apg_num_envs": apg_num_envs,
+        "apg_episode_length": apg_episode_length,
+        "warmup_unrolls": 1,
+    }
+    base = load_preset("default") | {"num_timesteps": steps, "num_envs": lanes, "unroll_length": 5, "batch_size": 8}
     ours = Config.model_validate(base | changes, strict=False)
-    climbing = ours.unrolls - ours.learning_unrolls
-    assert climbing == ours.climbs * ours.unrolls_per_climb <= fraction * ours.unrolls
-    assert ours.unrolls_per_climb * ours.unroll_size >= apg_lanes * apg_steps
-    assert climbing + ours.unrolls_per_climb > fraction * ours.unrolls - 1
+    climbing = ours.num_unrolls - ours.learning_unrolls
+    assert climbing == ours.num_apg_updates * ours.unrolls_per_apg_update <= fraction * ours.num_unrolls
+    assert ours.unrolls_per_apg_update * ours.steps_per_unroll >= apg_num_envs * apg_episode_length
+    assert climbing + ours.unrolls_per_apg_update > fraction * ours.num_unrolls - 1
 
 
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"apg_fraction": 0.99, "apg_steps": 10}, "before the analytic gradient"),
-        ({"apg_fraction": 0.4, "apg_lanes": 5}, "apg_lanes to be a multiple of shards"),
+        ({"apg_fraction": 0.99, "apg_episode_length": 10}, "before APG"),
+        ({"apg_fraction": 0.4, "apg_num_envs": 5}, "apg_num_envs to be a multiple of num_shards"),
         ({"apg_fraction": 1.1}, "apg_fraction"),
     ],
 )
@@ -225,7 +234,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_ends_with_its_climbs(whole: Path) -> None:
     """Each is an update, and stands for two unrolls of steps; what only minibatches have is 0."""
     run = run_config(**CLIMBING).learner
-    assert (run.learning_unrolls, run.climbs) == (18, 6)
+    assert (run.learning_unrolls, run.num_apg_updates) == (18, 6)
     rows = files.read_metrics(whole)
     assert [row["env_steps"] for row in rows] == [200, 400, 600, 800, 1040, 1200]  # not within a climb
     assert [row["updates"] for row in rows[-3:]] == [34 + 1, 34 + 4, 34 + 6]
@@ -234,7 +243,7 @@ def test_a_run_ends_with_its_climbs(whole: Path) -> None:
 
 def test_reports_among_the_climbs_wait_for_one(tmp_path: Path) -> None:
     """Asked for oftener than there are climbs: no row is without numbers, and none without a climb."""
-    train(tmp_path, run_config(**CLIMBING, reports=30), worlds.make("pendulum"))
+    train(tmp_path, run_config(**CLIMBING, num_evals=30), worlds.make("pendulum"))
     rows = files.read_metrics(tmp_path)
     assert [row["env_steps"] for row in rows] == [*range(40, 721, 40), *range(800, 1201, 80)]
     assert all(np.isfinite([row["reward_mean"], row["steps_per_second"]]).all() for row in rows)
@@ -267,7 +276,7 @@ def test_rewards_that_are_no_numbers_stop_the_climbs() -> None:
     trainer, points = Trainer(Nowhere(), config), stack([point(Nowhere(), config)])
     states = trainer.init(driver.seeds(0, 1), points)
     states = states._replace(unrolls=jnp.full(1, config.learning_unrolls, jnp.int32))
-    after = trainer.climb(states, points, np.int32(config.unrolls))
+    after = trainer.climb(states, points, np.int32(config.num_unrolls))
     assert (after.fault_update, after.fault_term) == (0, 0)
 
 
@@ -302,7 +311,7 @@ def test_members_do_not_mix(whole: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     """Vmapped beside another, a seed's climbs are its own."""
     env, config = worlds.make("pendulum"), run_config(**CLIMBING).learner
     trainer = Trainer(env, config)
-    learning, all_of_it = np.int32(config.learning_unrolls), np.int32(config.unrolls)
+    learning, all_of_it = np.int32(config.learning_unrolls), np.int32(config.num_unrolls)
 
     def climbed(count: int) -> list[np.ndarray]:
         points = stack([point(env, config)] * count)
@@ -320,5 +329,8 @@ def test_presets_that_climb_say_so_in_whole_unrolls() -> None:
     """What ships: the flights fit the steps that they are counted as."""
     for name in preset_names():
         config = Config.model_validate_json(json.dumps(load_preset("default") | load_preset(name)))
-        if config.climbs:
-            assert config.apg_lanes * config.apg_steps == config.unrolls_per_climb * config.unroll_size
+        if config.num_apg_updates:
+            assert (
+                config.apg_num_envs * config.apg_episode_length
+                == config.unrolls_per_apg_update * config.steps_per_unroll
+            )

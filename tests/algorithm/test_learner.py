@@ -9,7 +9,7 @@ from qrl.algorithm.learner import Hyper, Learner, LearnerState, Terms, hyper
 from qrl.algorithm.networks import log_density
 from qrl.algorithm.types import Transition
 from qrl.algorithm.vtrace import vtrace
-from qrl.config import TRACED, Config, load_preset
+from qrl.config import Config, Hyperparameters, load_preset
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
@@ -17,7 +17,7 @@ B, T, F, A = 3, 7, 5, 2
 
 
 def config(**changes: object) -> Config:
-    return Config.model_validate(load_preset("default") | {"normalise_observations": False} | changes, strict=False)
+    return Config.model_validate(load_preset("default") | {"normalize_observations": False} | changes, strict=False)
 
 
 def random_ends() -> np.ndarray:
@@ -86,13 +86,13 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
         carried = 0.0
         for i in reversed(range(d.reward.shape[1])):
             carried *= 0.0 if d.terminated[b, i] or d.truncated[b, i] else c.lam
-            for_ever = c.reward_scale * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
+            for_ever = c.reward_scaling * d.reward[b, i] * sum(c.gamma**k for k in range(2000))
             after = for_ever if d.out_of_bounds[b, i] else v_next[b, i]
             bootstrap = 0.0 if d.terminated[b, i] else after
-            a_trace[b, i] = c.reward_scale * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
+            a_trace[b, i] = c.reward_scaling * d.reward[b, i] + c.gamma * bootstrap - v[b, i] + c.gamma * carried
             carried = (min(1.0, ratio[b, i]) if off_policy else 1.0) * a_trace[b, i]
             v_trace[b, i] = v[b, i] + carried
-    a = a_trace / np.sqrt((a_trace**2).mean()) if c.normalise_advantage else a_trace
+    a = a_trace / np.sqrt((a_trace**2).mean()) if c.normalize_advantage else a_trace
     gain = (ratio - 1.0) * a if c.form == "ratio" else (np.exp(log_pi) - np.exp(d.log_mu)) * a
     limit = c.epsilon * np.abs(a) if c.xi is None else c.xi
     return -np.minimum(gain, limit).mean(), ((v - v_trace) ** 2).mean()
@@ -102,7 +102,7 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
     "changes",
     [
         {},
-        {"normalise_advantage": False, "observation_scale": [1.0, 0.5, 2.0, 1.0, 1.0]},
+        {"normalize_advantage": False, "observation_scale": [1.0, 0.5, 2.0, 1.0, 1.0]},
         {"form": "difference", "xi": 0.01},
         {"advantage": "mu", "form": "difference"},
         {"advantage": "mu", "lam": 0.9},
@@ -137,7 +137,7 @@ def test_members_side_by_side_have_their_own_ends() -> None:
 
 def test_update_ascends_both_losses() -> None:
     """Repeated updates on one batch lower the value loss and raise the objective."""
-    learner = Learner(config(learning_rate=1e-2, steps=1_000_000), F, A)
+    learner = Learner(config(learning_rate=1e-2, num_timesteps=1_000_000), F, A)
     data, update = batch(), jax.jit(learner.update)
     state, first = update(learner.init(jax.random.PRNGKey(1)), data)
     last = first
@@ -153,7 +153,7 @@ def test_normalised_the_policy_gradient_is_divided_by_the_deviation_of_a() -> No
     data = data._replace(reward=5.0 * data.reward)
     plain, normal = (
         jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)[1]
-        for learner in (Learner(config(normalise_advantage=on), F, A) for on in (False, True))
+        for learner in (Learner(config(normalize_advantage=on), F, A) for on in (False, True))
     )
     assert plain.a_trace > 2.0
     np.testing.assert_allclose(normal.policy_gradient, plain.policy_gradient / plain.a_trace, rtol=1e-5)
@@ -178,7 +178,7 @@ def test_a_minibatch_in_parts_is_the_whole(xi: float | None) -> None:
 
 def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
     """Targets and advantages are constants: scaling rewards by −1 leaves the critic's own pull, not a mixed one."""
-    learner = Learner(config(normalise_advantage=False), F, A)
+    learner = Learner(config(normalize_advantage=False), F, A)
     state, data = learner.init(jax.random.PRNGKey(1)), batch()
     gradient = jax.jit(jax.grad(lambda p: learner._loss(p, state, data)[0]))(state.params)
 
@@ -202,9 +202,9 @@ def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[ja
     after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
     log_pi = log_density(data.action, learner.policy.apply(state.params.policy, data.observation), c.sigma)
     rho = jnp.exp(log_pi - data.log_mu)
-    after = jnp.where(data.out_of_bounds > 0, c.reward_scale * data.reward / (1.0 - c.gamma), after)
+    after = jnp.where(data.out_of_bounds > 0, c.reward_scaling * data.reward / (1.0 - c.gamma), after)
     return jax.vmap(lambda *x: vtrace(*x, gamma=c.gamma, lam=c.lam))(
-        c.reward_scale * data.reward, value, after, data.terminated, data.truncated, rho
+        c.reward_scaling * data.reward, value, after, data.terminated, data.truncated, rho
     )
 
 
@@ -218,7 +218,9 @@ def test_sigma_is_log_linear_and_ends_where_it_should() -> None:
 
 def test_average_is_the_mean_of_the_last_policies() -> None:
     """With averaging on, what ships is the arithmetic mean of the policies of the run's last part."""
-    learner = Learner(config(steps=64 * 50 * 5, warmup_unrolls=1, updates_per_unroll=4, average_fraction=0.5), F, A)
+    learner = Learner(
+        config(num_timesteps=64 * 50 * 5, warmup_unrolls=1, updates_per_unroll=4, average_fraction=0.5), F, A
+    )
     state, data, update = learner.init(jax.random.PRNGKey(1)), batch(), jax.jit(learner.update)
     policies = []
     for _ in range(learner.total_updates):
@@ -231,8 +233,8 @@ def test_average_is_the_mean_of_the_last_policies() -> None:
 
 
 def test_observation_statistics_standardise() -> None:
-    """With normalise_observations the networks see zero mean and unit deviation."""
-    learner = Learner(config(normalise_observations=True), F, A)
+    """With normalize_observations the networks see zero mean and unit deviation."""
+    learner = Learner(config(normalize_observations=True), F, A)
     data = 3.0 + 2.0 * jax.random.normal(jax.random.PRNGKey(2), (4000, F))
     state = learner.observe(learner.init(jax.random.PRNGKey(0)), data)
     seen = learner.scale(state, data)
@@ -243,7 +245,7 @@ def test_observation_statistics_standardise() -> None:
 @pytest.fixture(scope="module")
 def traced() -> tuple[Hyper, object]:
     """Every hyperparameter that travels, and one compiled program of what they decide, half-way through a run."""
-    here = config(observation_scale=[1.0] * F, steps=64 * 50 * 4, gradient_clip=0.1, sigma=1.0, sigma_end=1.0)
+    here = config(observation_scale=[1.0] * F, num_timesteps=64 * 50 * 4, max_grad_norm=0.1, sigma=1.0, sigma_end=1.0)
     learner, data = Learner(here, F, A), batch()
     state = learner.init(jax.random.PRNGKey(1))._replace(updates=jnp.int32(learner.total_updates // 2))
 
@@ -258,7 +260,7 @@ def traced() -> tuple[Hyper, object]:
     return hyper(here), decided
 
 
-@pytest.mark.parametrize("name", TRACED)
+@pytest.mark.parametrize("name", Hyperparameters._fields)
 def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, name: str) -> None:
     """One compiled program, another value: another result. (None that is declared traced is a constant in it.)"""
     values, decided = traced
@@ -272,7 +274,7 @@ def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, na
 
 def test_other_values_make_the_learner_that_has_them(traced: tuple) -> None:
     """Under another configuration's values a learner does what one of that configuration does."""
-    changes = {"gamma": 0.9, "epsilon": 0.05, "sigma": 0.5, "learning_rate": 1e-3, "reward_scale": 0.3}
+    changes = {"gamma": 0.9, "epsilon": 0.05, "sigma": 0.5, "learning_rate": 1e-3, "reward_scaling": 0.3}
     there, data = Learner(config(**changes), F, A), batch()
     here = Learner(config(), F, A).under(hyper(there.config))
     np.testing.assert_array_equal(losses(here, data), losses(there, data))

@@ -99,7 +99,9 @@ def begin_of(env: Env) -> Callable[[jax.Array], Lanes]:
 def unroll_of(env: Env) -> Callable[..., tuple[Lanes, Transition]]:
     sigma = jnp.float32(SIGMA)
     return jax.jit(
-        lambda lanes, key, starts: rollout.unroll(env, lanes, mean, sigma, key, starts, unroll_steps=T, longest=LONGEST)
+        lambda lanes, key, starts: rollout.unroll(
+            env, lanes, mean, sigma, key, starts, unroll_length=T, longest=LONGEST
+        )
     )
 
 
@@ -237,18 +239,18 @@ def test_episodes_are_cut_at_the_longest(unfenced: Flight) -> None:
     assert not expected[:, np.arange(UNROLLS * T) % T != T - 1].any()  # whole unrolls: ends at unroll ends alone
 
 
-@pytest.mark.parametrize(("lanes", "longest", "unroll_steps"), [(8, 40, 10), (7, 200, 50), (3, 100, 50), (5, 30, 50)])
-def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll_steps: int) -> None:
+@pytest.mark.parametrize(("lanes", "longest", "unroll_length"), [(8, 40, 10), (7, 200, 50), (3, 100, 50), (5, 30, 50)])
+def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll_length: int) -> None:
     """Ages are multiples of an unroll, below the longest episode, spread over it as evenly as whole lanes can be."""
-    begun = jax.jit(lambda key: rollout.begin(PLAIN, key, jnp.arange(lanes), lanes, longest, unroll_steps))(
+    begun = jax.jit(lambda key: rollout.begin(PLAIN, key, jnp.arange(lanes), lanes, longest, unroll_length))(
         jax.random.key(0)
     )
     ages = np.asarray(begun.steps)
-    assert (ages % unroll_steps == 0).all()
+    assert (ages % unroll_length == 0).all()
     assert ages.min() == 0
     assert ages.max() < longest
     _, counts = np.unique(ages, return_counts=True)
-    assert len(counts) == min(lanes, -(-longest // unroll_steps))
+    assert len(counts) == min(lanes, -(-longest // unroll_length))
     assert counts.max() - counts.min() <= 1
     assert not begun.ended.any()
     assert len(np.unique(begun.state.obs, axis=0)) == lanes
@@ -354,7 +356,7 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
         key = jax.random.PRNGKey(3)
         begun = rollout.begin(env, key, jnp.arange(lanes), lanes, LONGEST, T)
         mean, sigma = (lambda observation: jnp.zeros((*observation.shape[:-1], env.action_size))), jnp.float32(0.5)
-        after, steps = rollout.unroll(env, begun, mean, sigma, key, key, unroll_steps=3 * T, longest=LONGEST)
+        after, steps = rollout.unroll(env, begun, mean, sigma, key, key, unroll_length=3 * T, longest=LONGEST)
         return steps, after.state, after.steps, after.ended, after.start + after.used, after.early
 
     at_once = jax.jit(run)()
@@ -374,7 +376,7 @@ def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
     @jax.jit
     def run(key: jax.Array) -> tuple[Lanes, Transition]:
         lanes = rollout.begin(env, key, jnp.arange(4), 4, 100, 50)
-        return lanes, rollout.unroll(env, lanes, still, sigma, key, key, unroll_steps=50, longest=100)[1]
+        return lanes, rollout.unroll(env, lanes, still, sigma, key, key, unroll_length=50, longest=100)[1]
 
     lanes, steps = run(jax.random.key(0))
     step, fled = jax.jit(env.step), 0

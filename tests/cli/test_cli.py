@@ -24,7 +24,7 @@ def test_training_leaves_the_run_folder(trained: Path) -> None:
     assert header.startswith("env_steps,updates,return_mean,return_min,success,train_seconds,")
     config = json.loads((trained / "config.json").read_text())
     assert config["task"]["spec"]["rod"]["mass_kg"] == 1.0
-    assert config["learner"]["steps"] == 400
+    assert config["learner"]["num_timesteps"] == 400
     assert config["versions"]["jax"]
 
 
@@ -65,8 +65,8 @@ def test_evaluate_flies_the_last_checkpoints(trained: Path, tmp_path: Path, caps
 def test_brax_is_imported_for_its_own_tasks_alone() -> None:
     """It takes longer than all else that a command begins with."""
     program = (
-        "import sys; from qrl import deploy, request, sweep_command, train_command, view_command;"
-        "print([(name, request.environment(request.task_record(name)).action_size, 'brax' in sys.modules)"
+        "import sys; from qrl import tasks; from qrl.cli import export, sweep, train, view;"
+        "print([(name, tasks.environment(tasks.task_record(name)).action_size, 'brax' in sys.modules)"
         " for name in ('hover', 'pendulum', 'fast')])"
     )
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
@@ -173,7 +173,7 @@ def test_run_that_exists_is_refused(trained: Path, capsys: pytest.CaptureFixture
         (["hover"], "not the same task"),
         (["pendulum", "--seed", "3"], "key 'seed' is 0, found 3"),
         (["pendulum", "--gamma", "0.5"], "key 'learner.gamma' is 0.9"),
-        (["pendulum", "--preset", "circle"], "key 'learner.steps' is"),
+        (["pendulum", "--preset", "circle"], "key 'learner.num_timesteps' is"),
     ],
 )
 def test_resume_of_another_run_is_refused(
@@ -189,17 +189,23 @@ def test_resume_of_another_run_is_refused(
         (["inverted_pendulun"], "did you mean 'inverted_pendulum'?"),
         ([], "no task given"),
         (["nowhere.json"], "nowhere.json: cannot be read"),
-        (["hover", "--stepz", "3"], "unknown flag --stepz (did you mean --steps?)"),
-        (["hover", "--steps", "many"], "command line: key 'steps': expected a valid integer, found \"many\""),
-        (["hover", "--steps", "-5"], "command line: key 'steps': expected greater than or equal to 1, found -5"),
+        (["hover", "--num-timestepz", "3"], "unknown flag --num-timestepz (did you mean --num-timesteps?)"),
+        (
+            ["hover", "--num-timesteps", "many"],
+            "command line: key 'num_timesteps': expected a valid integer, found \"many\"",
+        ),
+        (
+            ["hover", "--num-timesteps", "-5"],
+            "command line: key 'num_timesteps': expected greater than or equal to 1, found -5",
+        ),
         (["hover", "--gamma", "1.5"], "key 'gamma': expected less than or equal to 1, found 1.5"),
         (["hover", "--preset", "hovr"], "--preset: no preset 'hovr' (did you mean 'hover'?)"),
         (["hover", "--seed", "x"], "--seed: invalid whole_number value: 'x'"),
         (["hover", "--form", "quotient"], "key 'form': expected 'ratio' or 'difference', found \"quotient\""),
         (["hover", "--observation-scale", "[1,2]"], "expected 18 numbers"),
-        (["hover", "--steps", "100"], "expected steps of at least"),
+        (["hover", "--num-timesteps", "100"], "expected num_timesteps of at least"),
         (["hover", "--config", "nowhere.json"], "nowhere.json: cannot be read"),
-        (["hover", "--steps", "1e20"], "key 'steps': expected less than 2147483648"),
+        (["hover", "--num-timesteps", "1e20"], "key 'num_timesteps': expected less than 2147483648"),
         (["hover", "--seed", "1e20"], "--seed: invalid whole_number value: '1e20'"),
     ],
 )
@@ -216,7 +222,7 @@ def test_wrong_input_is_one_clear_line(
     [
         ('{"learner": {"gama": 0.9}}', "learner: unknown key 'gama' (did you mean 'gamma'?)"),
         ('{"learnr": {}}', "unknown key 'learnr' (did you mean 'learner'?)"),
-        ('{"learner": {"lanes": "four"}}', "key 'lanes': expected a valid integer, found \"four\""),
+        ('{"learner": {"num_envs": "four"}}', "key 'num_envs': expected a valid integer, found \"four\""),
         ('{"task": "circle"}', "expected the task asked for, 'hover', found 'circle'"),
         ('{"seed": -1}', "key 'seed': expected greater than or equal to 0, found -1"),
         ("[1, 2]", "expected a JSON object, found list"),
@@ -292,7 +298,7 @@ def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.usefixtures("quick_compilation")
 def test_foreign_environment_trains(tmp_path: Path) -> None:
     """Our learner on one of Brax's own environments, which measures no success."""
-    assert qrl("train", "inverted_pendulum", "--out", tmp_path / "run", "--episode-steps", "20", *TINY.split()) == 0
+    assert qrl("train", "inverted_pendulum", "--out", tmp_path / "run", "--episode-length", "20", *TINY.split()) == 0
     rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
     assert rows[1].split(",")[4] == ""  # success
     assert not (tmp_path / "run" / "flight.png").exists()
@@ -301,7 +307,7 @@ def test_foreign_environment_trains(tmp_path: Path) -> None:
 def test_foreign_environment_resumes(tmp_path: Path) -> None:
     """Its rows have empty cells: a run that lost its end goes on all the same. (This one compiles at once.)"""
     run = tmp_path / "run"
-    assert qrl("train", "fast", "--out", run, "--episode-steps", "20", *TINY.split()) == 0
+    assert qrl("train", "fast", "--out", run, "--episode-length", "20", *TINY.split()) == 0
     rows = (run / "metrics.csv").read_text().splitlines()[1:]
     assert [row.split(",")[4] for row in rows] == ["", ""]  # success
     (run / "summary.json").unlink()
@@ -313,7 +319,7 @@ def test_foreign_environment_resumes(tmp_path: Path) -> None:
 def test_interrupted_run_is_saved_and_goes_on(tmp_path: Path) -> None:
     """Ctrl-C after the first report: exit 1 with the way on; RESUME finishes the run."""
     out = tmp_path / "run"
-    words = ["train", "pendulum", "--out", str(out), *TINY.split(), "--steps", "2e6", "--reports", "20000"]
+    words = ["train", "pendulum", "--out", str(out), *TINY.split(), "--num-timesteps", "2e6", "--num-evals", "20000"]
     process = subprocess.Popen(
         [sys.executable, "-m", "qrl", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ
     )

@@ -36,9 +36,13 @@ BUDGET = 2e7  # bytes of a grid's points
 PENDULUM = tasks.task_record("pendulum")
 LEARNER = specfile.build(Config, tasks.task_preset(PENDULUM, ""), "")
 RUN = RunConfig(task=PENDULUM, learner=LEARNER, seed=3, seeds=2, versions={"jax": "1"}, devices=["cpu"])
-PART = {"task": "circle", "learner": {"gamma": 0.9, "policy_hidden": [8, 8], "observation_scale": [1] * 18}, "seed": 1}
+PART = {
+    "task": "circle",
+    "learner": {"gamma": 0.9, "policy_hidden_layer_sizes": [8, 8], "observation_scale": [1] * 18},
+    "seed": 1,
+}
 
-FEW = {"steps": 4e4, "reports": 2}
+FEW = {"num_timesteps": 4e4, "num_evals": 2}
 LISTED = {"task": "pendulum", "fixed": FEW, "axes": {"gamma": [0.9, 0.99], "task.rod.mass_kg": [1, 2]}, "seeds": 2}
 NAMED = {"task": "hover", "axes": {"m": {"a": {}, "b": {"lam": 0.5}}, "task.vehicle.motors.*.max_N": [5, 6]}}
 RANGE = {"from": 1e-3, "to": 0.5, "spacing": "log"}

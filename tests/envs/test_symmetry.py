@@ -137,7 +137,7 @@ def test_the_pendulum_swings_either_way() -> None:
 def test_a_minibatch_is_turned_trajectory_by_trajectory() -> None:
     """Observations and actions by the symmetry that each trajectory's numbers draw; all else is left."""
     env, rng = worlds.make("hover"), np.random.default_rng(0)
-    learner = Config.model_validate_json(json.dumps(load_preset("hover") | {"lanes": 8, "minibatch_lanes": 3}))
+    learner = Config.model_validate_json(json.dumps(load_preset("hover") | {"num_envs": 8, "batch_size": 3}))
     shape, turns = (3, 5), jnp.asarray(rng.random((3, 2)), jnp.float32)
     scalars = [jnp.asarray(rng.normal(size=shape), jnp.float32) for _ in range(5)]
     observation, after = jnp.asarray(rng.normal(size=(2, *shape, 18)), jnp.float32)

@@ -121,7 +121,7 @@ def test_a_foreign_environment_exports(
 ) -> None:
     """One of Brax's own, the one that compiles at once: all that is known of its ports is their order."""
     run = tmp_path / "run"
-    assert qrl("train", "fast", "--out", run, "--episode-steps", "20", *TINY.split()) == 0
+    assert qrl("train", "fast", "--out", run, "--episode-length", "20", *TINY.split()) == 0
     assert "'fast' does not say its control period" in complaint(capsys, "export", run, *LEAST)
     monkeypatch.setattr(Fast, "dt", 0.02, raising=False)  # as all but this one do
     assert qrl("export", run, *LEAST) == 0
@@ -159,8 +159,14 @@ BROKEN = {
     "another format": (lambda run: altered(run, format=2), "key 'format'"),
     "not JSON": (lambda run: (run / "config.json").write_text('{"format": 1,'), "config.json"),
     "several seeds": (lambda run: altered(run, seeds=3), "holds 3 seeds; name one of them, such as RUN="),
-    "another network": (lambda run: altered(run, learner={"policy_hidden": [8]}), "of another run than config.json"),
-    "one layer more": (lambda run: altered(run, learner={"policy_hidden": [4, 4]}), "of another run than config.json"),
+    "another network": (
+        lambda run: altered(run, learner={"policy_hidden_layer_sizes": [8]}),
+        "of another run than config.json",
+    ),
+    "one layer more": (
+        lambda run: altered(run, learner={"policy_hidden_layer_sizes": [4, 4]}),
+        "of another run than config.json",
+    ),
     "an activation": (lambda run: altered(run, learner={"activation": "gelu"}), "key 'learner.activation'"),
 }
 

@@ -32,7 +32,7 @@ from qrl.training.trainer import Trainer
 from qrl_envs import env as worlds
 from qrl_envs import task
 
-HOVER = Wanted("hover", "hover", "hover_fast", {"steps": 320_000}, 2)
+HOVER = Wanted("hover", "hover", "hover_fast", {"num_timesteps": 320_000}, 2)
 
 
 def folder_of(path: Path, one: Wanted, *, finished: bool = True, **changes: Any) -> Path:
@@ -139,7 +139,7 @@ def test_an_unfinished_run_goes_on_and_a_stale_one_is_made_again(
         (folder.mkdir() if not folder.exists() else (folder / "kept").touch())
         figure_runs.make(HOVER, folder)
         assert (folder / CODE).read_text() == figure_runs.sha256()
-    words = ["train", "hover", "--seeds", "2", "--preset", "hover_fast", "--steps", "320000", "--out"]
+    words = ["train", "hover", "--seeds", "2", "--preset", "hover_fast", "--num-timesteps", "320000", "--out"]
     assert called == [
         [*words, str(unfinished), "--resume"],
         [*words, str(stale)],
@@ -285,7 +285,7 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Position and velocity are the paper's, the rest that of the first starts of `make evaluate`."""
-    small = HOVER._replace(flags={"policy_hidden": (4,), "critic_hidden": (4,)}, seeds=1)
+    small = HOVER._replace(flags={"policy_hidden_layer_sizes": (4,), "critic_hidden_layer_sizes": (4,)}, seeds=1)
     folder, config = folder_of(tmp_path / "run", small), small.config()
 
     def untrained(env: Any, *_: object) -> tuple[Trainer, Any, int]:
@@ -320,7 +320,7 @@ def test_a_caption_says_how_it_was_made_and_its_numbers_are_the_runs(tmp_path: P
     assert "after 200 [200 … 300] (median, range) steps" in page
     assert "**Verdict: exceeded.**" in page
     assert "`make figures FAST=1` at commit abc123; a note" in page
-    assert "- `hover`: `qrl train hover --seeds 2 --preset hover_fast --steps 320000`, seeds 0–1" in page
+    assert "- `hover`: `qrl train hover --seeds 2 --preset hover_fast --num-timesteps 320000`, seeds 0–1" in page
     for name, version in record.versions().items():
         assert f"{name} {version}" in page
     devices = [f"TFRT_CPU_{i}" for i in range(2)]

@@ -6,10 +6,9 @@ import pytest
 
 from qrl.cli.main import main
 
-TINY = (
-    "--steps 400 --lanes 4 --unroll-steps 10 --minibatch-lanes 2 --updates-per-unroll 1 --reports 2 --report-flights 3"
-)
-TINY += " --warmup-unrolls 2 --ring-unrolls 2 --policy-hidden [4] --critic-hidden [4]"
+TINY = "--num-timesteps 400 --num-envs 4 --unroll-length 10 --batch-size 2 --updates-per-unroll 1 --num-evals 2"
+TINY += " --num-eval-envs 3 --warmup-unrolls 2 --replay-unrolls 2"
+TINY += " --policy-hidden-layer-sizes [4] --critic-hidden-layer-sizes [4]"
 
 
 def qrl(*words: str | Path) -> int:

@@ -27,13 +27,14 @@ PATIENCE = 400.0  # seconds: whatever takes longer hangs
 
 # One configuration for all, so that its programs are compiled once.
 SIZES = (
-    "--lanes 16 --unroll-steps 20 --ring-unrolls 4 --warmup-unrolls 2 --updates-per-unroll 4 --minibatch-lanes 8"
-    " --policy-hidden [8] --critic-hidden [8] --reports 12 --report-flights 4 --steps 7.68e4"
+    "--num-envs 16 --unroll-length 20 --replay-unrolls 4 --warmup-unrolls 2 --updates-per-unroll 4 --batch-size 8"
+    " --policy-hidden-layer-sizes [8] --critic-hidden-layer-sizes [8] --num-evals 12"
+    " --num-eval-envs 4 --num-timesteps 7.68e4"
 )
 STEPS, REPORTS = 76_800, 12
 TRAIN = ["train", "pendulum", *SIZES.split()]
 LONG_STEPS, LONG_REPORTS = 2_048_000, 160  # for many kills in a row: a second of training between two
-LONG = [*TRAIN, "--steps", str(LONG_STEPS), "--reports", str(LONG_REPORTS)]
+LONG = [*TRAIN, "--num-timesteps", str(LONG_STEPS), "--num-evals", str(LONG_REPORTS)]
 
 
 class Ended(NamedTuple):

@@ -18,20 +18,20 @@ from qrl.training.trainer import Trainer
 from qrl_envs import env as worlds
 
 LITTLE = {
-    "lanes": 16,
-    "unroll_steps": 10,
-    "episode_steps": 20,
-    "ring_unrolls": 3,
+    "num_envs": 16,
+    "unroll_length": 10,
+    "episode_length": 20,
+    "replay_unrolls": 3,
     "warmup_unrolls": 2,
     "updates_per_unroll": 5,
-    "minibatch_lanes": 16,
-    "policy_hidden": [16],
-    "critic_hidden": [16],
-    "normalise_observations": True,
-    "report_flights": 5,
+    "batch_size": 16,
+    "policy_hidden_layer_sizes": [16],
+    "critic_hidden_layer_sizes": [16],
+    "normalize_observations": True,
+    "num_eval_envs": 5,
     "apg_fraction": 0.5,
-    "apg_lanes": 16,
-    "apg_steps": 20,
+    "apg_num_envs": 16,
+    "apg_episode_length": 20,
 }
 TEN_UPDATES = 3  # unrolls
 CLIMBS = 3
@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
     saved = None
     for seeds, count in ((1, 1), (1, 2), (1, 8), (2, 8)):
         points = stack([point(env, config)] * seeds)
-        trainer = Trainer(env, config, spread(jax.devices()[:count], seeds, config.logical_shards))
+        trainer = Trainer(env, config, spread(jax.devices()[:count], seeds, config.shard_count))
         states = trainer.advance(trainer.init(driver.seeds(5, seeds), points), points, np.int32(TEN_UPDATES))
         flights = trainer.fly(states.learner, points, driver.report_starts(config))
         np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.on_host((states, flights))))
@@ -58,7 +58,7 @@ def main(folder: Path) -> None:
             if count == 2:
                 continue
             learnt = trainer.place(stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))
-            until = config.learning_unrolls + CLIMBS * config.unrolls_per_climb
+            until = config.learning_unrolls + CLIMBS * config.unrolls_per_apg_update
             climbed = trainer.climb(learnt, points, np.int32(until))
             np.savez(folder / f"climbed-{count}.npz", **named(trainer.on_host(climbed)))
 

@@ -79,7 +79,7 @@ def _ports(sizes: tuple[int, ...]) -> tuple[tuple[Observed, ...], tuple[Acted, .
 def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0, samples: int = 1500) -> Policy:
     """A lively policy of these layer sizes: actions spread over their range, some of them clipped.
 
-    The odd one normalises its observations and clips them, as a run with `normalise_observations` does.
+    The odd one normalises its observations and clips them, as a run with `normalize_observations` does.
     """
     rng = np.random.default_rng([seed, *sizes])
     flights = {18: hover_flights, 3: pendulum_flights, 5: odd_flights}[sizes[0]](rng, samples)

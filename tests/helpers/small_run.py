@@ -11,18 +11,18 @@ from qrl.runs.record import RunConfig, TaskRecord
 from qrl.training import loop
 
 SMALL = {
-    "steps": 1200,
-    "lanes": 4,
-    "unroll_steps": 10,
-    "ring_unrolls": 3,
+    "num_timesteps": 1200,
+    "num_envs": 4,
+    "unroll_length": 10,
+    "replay_unrolls": 3,
     "warmup_unrolls": 2,
     "updates_per_unroll": 2,
-    "minibatch_lanes": 2,
-    "policy_hidden": [8],
-    "critic_hidden": [8],
-    "reports": 6,
-    "report_flights": 3,
-    "normalise_observations": True,
+    "batch_size": 2,
+    "policy_hidden_layer_sizes": [8],
+    "critic_hidden_layer_sizes": [8],
+    "num_evals": 6,
+    "num_eval_envs": 3,
+    "normalize_observations": True,
 }
 
 

@@ -127,7 +127,7 @@ def test_damaged_checkpoint_is_found_and_the_one_before_used(
 ) -> None:
     """Every file of the newest one: named in a note, the rest set aside as it is, the one before restored."""
     last, before = checkpoint.steps(small)[:2]
-    names = files(newest(small))
+    names = all_files(newest(small))
     for name in names if TORTURE else {*names[DAMAGE.index(how) :: 4], NAME}:
         run = copy(small, tmp_path / "run")
         victim = newest(run) / name
@@ -470,7 +470,10 @@ def stopped(tmp_path: Path, whole: Path) -> Path:
     ("words", "says"),
     [
         (["hover"], "not the same task"),
-        (["pendulum", *TRAIN[2:], "--policy-hidden", "[16]"], "key 'learner.policy_hidden' is (8,), asked for (16,)"),
+        (
+            ["pendulum", *TRAIN[2:], "--policy-hidden-layer-sizes", "[16]"],
+            "key 'learner.policy_hidden_layer_sizes' is (8,), asked for (16,)",
+        ),
         (["pendulum", "--seed", "7"], "key 'seed' is 0, found 7"),
     ],
     ids=["task", "network", "seed"],

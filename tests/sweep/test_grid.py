@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qrl import tasks
-from qrl.config import TRACED, Config, load_preset
+from qrl.config import Config, Hyperparameters, load_preset
 from qrl.sweep import grid
 from qrl.sweep.axes import Axis
 from qrl_envs.specfile import BadInput
@@ -34,9 +34,10 @@ def test_every_hyperparameter_is_declared_traced_or_static() -> None:
     for name, field in Config.model_fields.items():
         assert len({"traced", "static"} & set(field.metadata)) == 1, name
     config = Config.model_validate(tasks.task_preset(tasks.task_record("hover"), ""), strict=False)
-    assert set(TRACED) - set(config.traced) == {"xi"}  # null there
-    assert all(isinstance(v, float) or all(isinstance(x, float) for x in v) for v in config.traced.values())
-    assert not set(config.static) & set(TRACED)
+    traced = {name for name, field in Config.model_fields.items() if "traced" in field.metadata}
+    assert traced == set(Hyperparameters._fields)
+    assert {name for name, x in config.hyperparameters._asdict().items() if x is None} == {"xi"}
+    assert not set(config.static) & traced
 
 
 @pytest.mark.parametrize("path", sorted(GRIDS.glob("*.json")), ids=lambda path: path.stem)
@@ -46,8 +47,8 @@ def test_shipped_grids_are_valid(path: Path) -> None:
     programs = {"pendulum_lr": 2, "epsilon_replay": 4, "circle_weights": 1, "ablation_pendulum": 7, "ablation_hover": 7}
     assert len(found.groups()) == programs[path.stem]
     for point in found.points:
-        assert point.learner.steps <= 3e6
-        assert not point.learner.climbs
+        assert point.learner.num_timesteps <= 3e6
+        assert not point.learner.num_apg_updates
         tasks.check(tasks.environment(point.task), point.learner, "")
 
 
@@ -57,13 +58,13 @@ def test_the_three_grids_of_the_paper_ship() -> None:
 
 def test_points_are_the_product_of_the_axes(tmp_path: Path) -> None:
     """Every combination once, in the axes' order, laid over `fixed`, over the task's preset."""
-    axes = {"gamma": [0.9, 0.95], "task.rod.mass_kg": [1.0, 2.0], "lanes": [8, 16]}
+    axes = {"gamma": [0.9, 0.95], "task.rod.mass_kg": [1.0, 2.0], "num_envs": [8, 16]}
     found = load(tmp_path, {"task": "pendulum", "fixed": {"sigma": 0.7}, "axes": axes, "seeds": [3, 5]})
-    seen = [(p.learner.gamma, spec(p)["rod"]["mass_kg"], p.learner.lanes) for p in found.points]
+    seen = [(p.learner.gamma, spec(p)["rod"]["mass_kg"], p.learner.num_envs) for p in found.points]
     assert seen == list(itertools.product(*axes.values()))
     assert {(p.learner.sigma, p.learner.activation) for p in found.points} == {(0.7, "tanh")}
     assert found.seeds == (3, 5)
-    assert [[found.points[i].learner.lanes for i in group] for group in found.groups()] == [[8] * 4, [16] * 4]
+    assert [[found.points[i].learner.num_envs for i in group] for group in found.groups()] == [[8] * 4, [16] * 4]
 
 
 @pytest.mark.parametrize("spacing", ["lin", "log"])
@@ -107,11 +108,11 @@ def test_a_path_reaches_into_the_vehicle(tmp_path: Path) -> None:
 
 
 def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
-    named = {"ours": {}, "PPO": {"ring_unrolls": 1, "lam": 0.93}}
+    named = {"ours": {}, "PPO": {"replay_unrolls": 1, "lam": 0.93}}
     preset = load_preset("pendulum")
-    ours = ("ours", preset["ring_unrolls"], preset["lam"])
+    ours = ("ours", preset["replay_unrolls"], preset["lam"])
     found = load(tmp_path, {"task": "pendulum", "axes": {"method": named, "gamma": [0.9, 0.99]}})
-    assert [(p.place["method"], p.learner.ring_unrolls, p.learner.lam) for p in found.points] == [
+    assert [(p.place["method"], p.learner.replay_unrolls, p.learner.lam) for p in found.points] == [
         ours,
         ours,
         ("PPO", 1, 0.93),
@@ -132,7 +133,7 @@ def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
         ("xi", [None, 0.2], 2),
         ("task.episode_steps", [100, 200], 2),
         ("form", ["ratio", "difference"], 2),
-        ("minibatch_lanes", [8, 16], 2),
+        ("batch_size", [8, 16], 2),
     ],
 )
 def test_only_static_values_make_programs(tmp_path: Path, axis: str, values: list, programs: int) -> None:
@@ -150,7 +151,7 @@ def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -
         assert len(load(tmp_path, {"task": "pendulum", "axes": axes}).points) == 2
         with pytest.raises(BadInput, match=f"judged alike, found another {what}"):
             load(tmp_path, {"task": str(task), "axes": axes})
-    load(tmp_path, {"task": "pendulum", "axes": {"episode_steps": [100, 200]}})
+    load(tmp_path, {"task": "pendulum", "axes": {"episode_length": [100, 200]}})
 
 
 GAMMA = {"gamma": [0.9, 0.99]}
@@ -177,11 +178,14 @@ WRONG: dict[str, tuple[dict, str]] = {
     "wrong type of value": ({"axes": {"gamma": ["much"]}}, r"at gamma much: key 'gamma': expected a valid number"),
     "wrong sense": ({"axes": {"sigma": [0.5, -1.0]}}, r"at sigma -1.0: key 'sigma': expected greater than 0"),
     "not a number": ({"axes": {"sigma": [float("nan")]}}, r"key 'sigma': expected a finite number"),
-    "a fraction of a count": ({"axes": {"lanes": [8, 8.5]}}, r"at lanes 8.5: key 'lanes'"),
+    "a fraction of a count": ({"axes": {"num_envs": [8, 8.5]}}, r"at num_envs 8.5: key 'num_envs'"),
     "wrong sense in the task": ({"axes": {"task.rod.mass_kg": [-1.0]}}, r"key 'rod.mass_kg': expected greater than 0"),
     "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"judged is the same for all points"),
     "duplicate values": ({"axes": {"gamma": [0.9, 0.9]}}, r"expected each point once, found gamma 0.9 and gamma 0.9"),
-    "duplicate by another way": ({"axes": {"lanes": [16, 16.0]}}, r"each point once, found lanes 16.0 and lanes 16"),
+    "duplicate by another way": (
+        {"axes": {"num_envs": [16, 16.0]}},
+        r"each point once, found num_envs 16.0 and num_envs 16",
+    ),
     "called like a column": (
         {"axes": {"seeds": {"a": {"gamma": 0.9}}}},
         r"key 'axes.seeds': expected another name than that of a column of results.csv, found 'seeds'",
@@ -207,11 +211,11 @@ WRONG: dict[str, tuple[dict, str]] = {
         r"judged alike, found another number of steps of its return at task.episode_steps 200 and at",
     ),
     "flights of other lengths": (
-        {"task": "inverted_pendulum", "axes": {"episode_steps": [200, 100]}},
-        r"judged alike, found another length of a flight \(episode_steps\) at episode_steps 200 and at",
+        {"task": "inverted_pendulum", "axes": {"episode_length": [200, 100]}},
+        r"judged alike, found another length of a flight \(episode_length\) at episode_length 200 and at",
     ),
     "other starts": (
-        {"axes": {"report_flights": [10, 20]}},
+        {"axes": {"num_eval_envs": [10, 20]}},
         r"judged alike, found another number of flights",
     ),
     "fixed and axis": ({"axes": GAMMA, "fixed": {"gamma": 0.9}}, r"'axes.gamma': 'gamma' is set in 'fixed' too"),

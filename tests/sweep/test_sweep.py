@@ -22,7 +22,7 @@ from qrl.runs import files
 from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import load
 from qrl.sweep.runner import Group, Member, Result
-from qrl.training import devices, driver, multihost
+from qrl.training import driver, multihost
 from qrl.training import trainer as train
 from qrl.training.state import TrainState, point, stack
 from qrl.training.trainer import Trainer
@@ -30,17 +30,17 @@ from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 
 TINY = {
-    "steps": 400,
-    "lanes": 4,
-    "unroll_steps": 10,
-    "minibatch_lanes": 2,
+    "num_timesteps": 400,
+    "num_envs": 4,
+    "unroll_length": 10,
+    "batch_size": 2,
     "updates_per_unroll": 1,
-    "reports": 2,
-    "report_flights": 3,
+    "num_evals": 2,
+    "num_eval_envs": 3,
     "warmup_unrolls": 2,
-    "ring_unrolls": 2,
-    "policy_hidden": [4],
-    "critic_hidden": [4],
+    "replay_unrolls": 2,
+    "policy_hidden_layer_sizes": [4],
+    "critic_hidden_layer_sizes": [4],
 }
 AXES = {"learning_rate": [1e-3, 1e-2, 1e30], "task.rod.mass_kg": [1.3, 1.0]}  # the last step size diverges
 Rows = list[dict[str, str]]
@@ -102,7 +102,7 @@ def test_one_program_for_points_that_differ_in_traced_values(done: Path) -> None
 
 def test_one_program_for_each_static_value(tmp_path: Path, compiled: list[str]) -> None:
     compiled.clear()
-    axes = {"gamma": [0.9, 0.99], "normalise_advantage": [True, False]}
+    axes = {"gamma": [0.9, 0.99], "normalize_advantage": [True, False]}
     assert qrl("sweep", write_grid(tmp_path, axes), "--out", tmp_path / "out") == 0
     assert sum("_advance_all" in name for name in compiled) == 2
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["programs"] == 2
@@ -224,7 +224,9 @@ def test_a_chunk_is_recorded_whole_or_not_at_all(tmp_path: Path, laps: int, reco
 
 def test_ctrl_c_ends_with_exit_code_1_and_keeps_its_chunks(tmp_path: Path) -> None:
     """A real process, a real SIGINT, after the first chunk of many; it leaves no results that look whole."""
-    grid = write_grid(tmp_path, {"gamma": {"from": 0.5, "to": 0.99, "count": 200}}, fixed={**TINY, "steps": 4000})
+    grid = write_grid(
+        tmp_path, {"gamma": {"from": 0.5, "to": 0.99, "count": 200}}, fixed={**TINY, "num_timesteps": 4000}
+    )
     process = subprocess.Popen(
         [sys.executable, "-m", "qrl", "sweep", grid, "--out", tmp_path / "out"],
         stdout=subprocess.PIPE,
@@ -313,10 +315,10 @@ def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: p
 
 def test_a_member_too_large_for_the_budget_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It says how many points and how much memory, and leaves nothing."""
-    small = {name: value for name, value in TINY.items() if name != "ring_unrolls"}
-    grid = write_grid(tmp_path, {"gamma": [0.8, 0.9], "ring_unrolls": [2, 1_000_000]}, fixed=small)
+    small = {name: value for name, value in TINY.items() if name != "replay_unrolls"}
+    grid = write_grid(tmp_path, {"gamma": [0.8, 0.9], "replay_unrolls": [2, 1_000_000]}, fixed=small)
     said = complaint(capsys, "sweep", grid, "--out", tmp_path / "out", "--memory-gb", "2")
-    assert "fit into 2 GB of memory, found 2 points (such as gamma 0.8, ring_unrolls 1000000)" in said
+    assert "fit into 2 GB of memory, found 2 points (such as gamma 0.8, replay_unrolls 1000000)" in said
     assert "GB\n" in said
     assert not (tmp_path / "out").exists()
 
@@ -335,7 +337,9 @@ def test_chunks_keep_to_the_budget(members: int, workers: int, budget: float) ->
 @pytest.mark.parametrize("members", [1, 8])
 def test_the_estimate_of_a_chunk_covers_what_xla_needs(tmp_path: Path, members: int) -> None:
     """XLA's own account of the compiled training: arguments, results and scratch."""
-    grid = load(write_grid(tmp_path, {"gamma": [0.9]}, fixed={**TINY, "ring_unrolls": 50, "steps": 4000}), 1e9)
+    grid = load(
+        write_grid(tmp_path, {"gamma": [0.9]}, fixed={**TINY, "replay_unrolls": 50, "num_timesteps": 4000}), 1e9
+    )
     env, config = worlds.make("pendulum"), grid.points[0].learner
     trainer, here = Trainer(env, config), point(env, config)
     points = stack([here] * members)
@@ -358,7 +362,7 @@ def test_vmapped_members_agree_with_members_in_turn(tmp_path: Path, monkeypatch:
     def last(in_turn: bool) -> TrainState:
         monkeypatch.setattr(train, "_in_turn", lambda _: in_turn)
         trainer = Trainer(worlds.make("pendulum"), config)
-        return trainer.advance(trainer.init(driver.seeds(0, 4), points), points, np.int32(config.unrolls))
+        return trainer.advance(trainer.init(driver.seeds(0, 4), points), points, np.int32(config.num_unrolls))
 
     in_turn, at_once = last(in_turn=True), last(in_turn=False)
     assert int(in_turn.learner.updates[0]) == 9
@@ -516,7 +520,7 @@ def test_a_process_that_cannot_know_is_refused(flags: tuple, env: dict, words: s
 def test_a_wrong_grid_is_refused_before_the_others_are_waited_for(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(devices, "join", lambda process: pytest.fail("joined"))
+    monkeypatch.setattr(multihost, "join", lambda process: pytest.fail("joined"))
     several = ("--processes", "2", "--process-id", "0", "--coordinator", "127.0.0.1:1")
     assert "unknown key 'gama'" in complaint(capsys, "sweep", write_grid(tmp_path, {"gama": [0.9]}), *several)
 

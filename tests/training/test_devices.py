@@ -16,7 +16,7 @@ from qrl.runs.record import ConfigFile, RunConfig
 from qrl.training import devices as processes
 
 CORES = processes._cores()
-LITTLE = {"minibatch_lanes": 8}  # 400 samples of 64 units
+LITTLE = {"batch_size": 8}  # 400 samples of 64 units
 
 
 def config(**changes: object) -> Config:
@@ -29,15 +29,15 @@ def config(**changes: object) -> Config:
         ({}, 1, 1, 1),
         ({}, 1, 2, 2),  # 800 samples of 64 units each
         ({}, 1, 16, 2),  # more parts of a member were not measured
-        ({"minibatch_lanes": 16}, 1, 2, 2),  # 400
+        ({"batch_size": 16}, 1, 2, 2),  # 400
         (LITTLE, 1, 2, 1),
-        (LITTLE | {"critic_hidden": [256, 256]}, 1, 2, 2),
-        (LITTLE | {"lanes": 4096}, 1, 2, 2),
+        (LITTLE | {"critic_hidden_layer_sizes": [256, 256]}, 1, 2, 2),
+        (LITTLE | {"num_envs": 4096}, 1, 2, 2),
         (LITTLE, 2, 2, 2),  # a member each
         (LITTLE, 6, 4, 3),
         (LITTLE, 3, 2, 1),
         ({}, 3, 2, 2),
-        ({"shards": 1}, 1, 2, 1),
+        ({"num_shards": 1}, 1, 2, 1),
         ({}, 1, 3, 2),  # three cannot divide eight shards
     ],
 )
@@ -73,7 +73,7 @@ def test_what_is_said_stays(said: dict, added: dict) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "environment"),
-    [(LITTLE, ONE_THREAD), ({"shards": 1}, {}), ({"shards": 1, "minibatch_lanes": 8, "lanes": 4096}, {})],
+    [(LITTLE, ONE_THREAD), ({"num_shards": 1}, {}), ({"num_shards": 1, "batch_size": 8, "num_envs": 4096}, {})],
     ids=["little", "much", "many lanes"],
 )
 def test_one_thread_for_little_work(changes: dict, environment: dict, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -87,8 +87,9 @@ def test_one_thread_for_little_work(changes: dict, environment: dict, monkeypatc
 PROGRAM = """
 import json, sys
 from pathlib import Path
-from qrl import processes, request
-from qrl.runs import ConfigFile
+from qrl import request
+from qrl.training import devices as processes
+from qrl.runs.record import ConfigFile
 changes, before = json.loads(sys.argv[1])
 processes.use_cores(request.run_config("hover", None, ConfigFile(learner=changes), {}, 0, 1), before)
 import jax
@@ -122,7 +123,7 @@ def test_jax_does_as_it_is_told() -> None:
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the system does not show a process's threads")
 def test_xla_does_as_it_is_told() -> None:
     """The variable is no documented one: counted are the threads that there are."""
-    few, many = (found(changes, [])[1] for changes in (LITTLE, {"shards": 1}))
+    few, many = (found(changes, [])[1] for changes in (LITTLE, {"num_shards": 1}))
     assert few < many
     assert many >= CORES
 

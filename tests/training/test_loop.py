@@ -86,7 +86,7 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, who
 @pytest.mark.parametrize("task", ["pendulum", "circle"])
 def test_the_same_seed_gives_the_same_bits_twice(tmp_path: Path, task: str) -> None:
     """State, ring, lanes and metrics."""
-    env, run = worlds.make(task), run_config(steps=400)
+    env, run = worlds.make(task), run_config(num_timesteps=400)
     for name in ("first", "again"):
         train(tmp_path / name, run, env)
     assert_same_leaves(leaves(tmp_path / "first"), leaves(tmp_path / "again"))

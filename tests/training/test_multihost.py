@@ -17,7 +17,7 @@ from qrl.runs.integrity import FORMAT, NAME
 
 SURVIVOR_SECONDS = 60.0  # in which the other has to end
 STEPS = 32_000
-TRAIN = [*fault_injection.TRAIN, "--steps", str(STEPS), "--reports", "5"]
+TRAIN = [*fault_injection.TRAIN, "--num-timesteps", str(STEPS), "--num-evals", "5"]
 # Compiled in haste, which takes half the time: each of the two compiles all of it, again and again.
 HASTE = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 TWO_DEVICES = {"JAX_NUM_CPU_DEVICES": "2", **HASTE}

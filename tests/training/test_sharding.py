@@ -92,11 +92,7 @@ def test_devices_are_shared_evenly(devices: int, members: int, shards: int, shap
     assert (tuple(mesh.shape.values()) if mesh else None) == shape
 
 
-@pytest.mark.parametrize(
-    ("lanes", "minibatch_lanes", "shards"), [(64, 8, 8), (16, 16, 8), (4, 2, 2), (12, 6, 2), (9, 5, 1)]
-)
-def test_shards_are_eight_or_what_divides(lanes: int, minibatch_lanes: int, shards: int) -> None:
-    config = Config.model_validate(
-        load_preset("default") | {"lanes": lanes, "minibatch_lanes": minibatch_lanes}, strict=False
-    )
-    assert config.logical_shards == shards
+@pytest.mark.parametrize(("lanes", "batch_size", "shards"), [(64, 8, 8), (16, 16, 8), (4, 2, 2), (12, 6, 2), (9, 5, 1)])
+def test_shards_are_eight_or_what_divides(lanes: int, batch_size: int, shards: int) -> None:
+    config = Config.model_validate(load_preset("default") | {"num_envs": lanes, "batch_size": batch_size}, strict=False)
+    assert config.shard_count == shards

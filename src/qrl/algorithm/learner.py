@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 
@@ -48,7 +47,7 @@ Hyper = dict[str, Any]  # the traced hyperparameters by name: float32 [], or [F]
 
 def hyper(config: Config) -> Hyper:
     """The traced hyperparameters of `config` as arrays; those that are null are absent."""
-    return {name: np.asarray(value, np.float32) for name, value in config.traced.items()}
+    return {k: v for k, v in config.hyperparameters._asdict().items() if v is not None}
 
 
 class Learner:
@@ -62,8 +61,8 @@ class Learner:
         self.config = config
         self.axis = axis
         self.observation_size = observation_size
-        self.policy = MLP(config.policy_hidden, action_size, config.activation, final_gain=0.01)
-        self.critic = MLP(config.critic_hidden, 1, config.activation, final_gain=1.0)
+        self.policy = MLP(config.policy_hidden_layer_sizes, action_size, config.activation, final_gain=0.01)
+        self.critic = MLP(config.critic_hidden_layer_sizes, 1, config.activation, final_gain=1.0)
         self.total_updates = max(1, (config.learning_unrolls - config.warmup_unrolls + 1) * config.updates_per_unroll)
         self._set(hyper(config))
 
@@ -76,7 +75,7 @@ class Learner:
     def _set(self, hyper: Hyper) -> None:
         self.hyper = hyper
         # For one flat vector of each network: far fewer, larger operations than leaf by leaf.
-        self._optimiser = optax.chain(optax.clip_by_global_norm(hyper["gradient_clip"]), optax.scale_by_adam())  # pyright: ignore[reportArgumentType]
+        self._optimiser = optax.chain(optax.clip_by_global_norm(hyper["max_grad_norm"]), optax.scale_by_adam())  # pyright: ignore[reportArgumentType]
 
     def init(self, key: chex.PRNGKey) -> LearnerState:
         policy_key, critic_key = jax.random.split(key)
@@ -101,7 +100,7 @@ class Learner:
 
     def scale(self, state: LearnerState, observation: chex.Array) -> chex.Array:
         """Observations as the networks see them; [..., F] -> [..., F]."""
-        if self.config.normalise_observations:
+        if self.config.normalize_observations:
             standard = (observation - state.statistics.mean) / deviation(state.statistics)
             observation = jnp.clip(standard, -MAX_NORMALISED, MAX_NORMALISED)
         return observation * self.hyper["observation_scale"] if "observation_scale" in self.hyper else observation
@@ -120,7 +119,7 @@ class Learner:
 
     def observe(self, state: LearnerState, observation: chex.Array) -> LearnerState:
         """Take observations [..., F] into the running statistics, where they are used."""
-        if not self.config.normalise_observations:
+        if not self.config.normalize_observations:
             return state
         batch = observation.reshape(-1, self.observation_size)
         return state._replace(statistics=merged(state.statistics, batch, self.axis))
@@ -128,7 +127,7 @@ class Learner:
     def update(self, state: LearnerState, batch: Transition) -> tuple[LearnerState, Terms]:
         """One step of both networks on a minibatch of trajectories (leaves [B, T, ...])."""
         gradient, terms = self._over_devices(jax.grad(self._loss, has_aux=True)(state.params, state, batch))
-        if self.config.normalise_advantage and not self._scaled_before:
+        if self.config.normalize_advantage and not self._scaled_before:
             divisor = _divisor(terms.a_trace)
             gradient = gradient._replace(policy=jax.tree.map(lambda x: x / divisor, gradient.policy))
             terms = terms._replace(policy_loss=terms.policy_loss / divisor)
@@ -152,7 +151,7 @@ class Learner:
 
         By the power 1.5: where it fell in proportion, policies still wandered by 2 mm near the end (docs/profile.md).
         """
-        return (1.0 - made / max(1, self.config.climbs)) ** 1.5
+        return (1.0 - made / max(1, self.config.num_apg_updates)) ** 1.5
 
     def climb(
         self,
@@ -189,7 +188,7 @@ class Learner:
         )
         terms = Terms(*[zero] * len(Terms._fields))
         terms = terms._replace(policy_loss=-means[0], policy_gradient=jnp.where(finite, norm, 0.0))
-        return state, terms, self.config.apg_lanes * means
+        return state, terms, self.config.apg_num_envs * means
 
     def _moved(
         self, params: chex.ArrayTree, gradient: chex.ArrayTree, optimiser: chex.ArrayTree, rate: chex.Array
@@ -214,7 +213,7 @@ class Learner:
         observation = self.scale(state, flat(batch.observation))
         value = _apply(self.critic, params.critic, observation).reshape(samples)
         next_value = _next_values(functools.partial(value_of, jax.lax.stop_gradient(params.critic)), value, batch)
-        reward = hyper["reward_scale"] * batch.reward
+        reward = hyper["reward_scaling"] * batch.reward
         # Beyond an environment's own bounds no transition begins, and so V is never fitted there: bootstrapped from, it
         # drew policies out and grew without end. In its place the last reward, for ever.
         for_ever = reward / jnp.maximum(1.0 - hyper["gamma"], MIN_DISCOUNTING)
@@ -264,7 +263,7 @@ class Learner:
 
         With xi = epsilon·|A| the objective is proportional to A, and its gradient may as well be divided afterwards.
         """
-        return self.config.normalise_advantage and "xi" in self.hyper
+        return self.config.normalize_advantage and "xi" in self.hyper
 
     def _over_devices(self, part: chex.ArrayTree) -> Any:
         """Means over the devices, in one exchange."""

@@ -39,7 +39,7 @@ def episode_steps(env: Env, configured: int | None) -> int:
     return configured or getattr(env, "episode_steps", 1000)
 
 
-def begin(env: Env, key: chex.PRNGKey, number: chex.Array, lanes: int, longest: int, unroll_steps: int) -> Lanes:
+def begin(env: Env, key: chex.PRNGKey, number: chex.Array, lanes: int, longest: int, unroll_length: int) -> Lanes:
     """Those of a run's `lanes` whose numbers are in `number` [N], at their first starts.
 
     They are staggered by whole unrolls, so that episodes do not end together.
@@ -47,7 +47,7 @@ def begin(env: Env, key: chex.PRNGKey, number: chex.Array, lanes: int, longest: 
     none = jnp.zeros(number.shape, bool)
     count = jnp.zeros(number.shape, jnp.int32)
     state = jax.vmap(env.reset)(_start_keys(key, number, count))
-    steps = number * longest // lanes // unroll_steps * unroll_steps
+    steps = number * longest // lanes // unroll_length * unroll_length
     return Lanes(number, state, steps.astype(jnp.int32), none, state, count, ~none, count)
 
 
@@ -92,7 +92,7 @@ def unroll(
     key: chex.PRNGKey,
     starts: chex.PRNGKey,
     *,
-    unroll_steps: int,
+    unroll_length: int,
     longest: int,
 ) -> tuple[Lanes, Transition]:
     """T steps of every lane under mu = N(mean(observation), sigma²·I); transitions with leaves [N, T, ...].
@@ -103,7 +103,7 @@ def unroll(
     more. The noise follows from `key`, which is this unroll's own; starts from `starts`, which is the key that `begin`
     had.
     """
-    noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), (unroll_steps, env.action_size)))
+    noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), (unroll_length, env.action_size)))
 
     def step(lanes: Lanes, noise: chex.Array) -> tuple[Lanes, Transition]:
         lanes = _restart(env, lanes, starts)

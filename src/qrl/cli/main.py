@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, complain
-from qrl.config import Config
+from qrl.config import FORMER_NAMES, Config
 
 
 class _Parser(argparse.ArgumentParser):
@@ -72,9 +72,15 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     train.add_argument("--resume", action="store_true", help="go on from the run folder's last checkpoint")
     train.add_argument("--preset", help="hyperparameters by name, in place of the task's preset", metavar="NAME")
     learner = train.add_argument_group("learner", "each as in the presets; the default is the task's preset")
+    former: dict[str, list[str]] = {}
+    for old, new in FORMER_NAMES.items():
+        former.setdefault(new, []).append(old)
     for name, field in Config.model_fields.items():
         text = (field.description or "").replace("%", "%%")
-        learner.add_argument(f"--{name.replace('_', '-')}", dest=f"learner.{name}", help=text, metavar="X")
+        flags = [f"--{flag.replace('_', '-')}" for flag in (name, *former.get(name, ()))]
+        learner.add_argument(flags[0], dest=f"learner.{name}", help=text, metavar="X")
+        if flags[1:]:
+            learner.add_argument(*flags[1:], dest=f"learner.{name}", help=argparse.SUPPRESS)
 
     evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts", allow_abbrev=False)
     evaluate.add_argument("run", type=Path, help="run folder", metavar="RUN")

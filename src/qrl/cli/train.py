@@ -111,10 +111,11 @@ def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, b
 
 
 def _steps(config: Config) -> str:
-    if not config.climbs:
-        return f"{config.steps:,} steps"
-    learning = config.learning_unrolls * config.unroll_size
-    return f"{config.steps:,} steps ({learning:,} to learn, then {config.climbs:,} updates by the analytic gradient)"
+    if not config.num_apg_updates:
+        return f"{config.num_timesteps:,} steps"
+    learning = config.learning_unrolls * config.steps_per_unroll
+    apg = f"{config.num_apg_updates:,} APG updates"
+    return f"{config.num_timesteps:,} steps ({learning:,} of the paper's method, then {apg})"
 
 
 def _flags(args: argparse.Namespace) -> dict[str, Any]:
@@ -151,7 +152,7 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> loop.Finished | 
     finished, started = None, time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=config.learner.unrolls * config.learner.unroll_size, note="")
+        task = bar.add_task("", total=config.learner.num_unrolls * config.learner.steps_per_unroll, note="")
         for event in events:
             if isinstance(event, loop.Compiling):
                 console.print("compiling")

@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from qrl.config import Config, Count, CountOrZero
+from qrl.config import Config, current_names
+from qrl_envs.specfile import Count, CountOrZero
 
 FORMAT: Literal[1] = 1
 _PACKAGES = ("qrl", "jax", "jaxlib", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -23,6 +24,12 @@ class TaskRecord(BaseModel):
 
     name: str
     spec: dict[str, Any] | None  # null: one of Brax's own environments
+
+
+def with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
+    """The content of a config.json, whole or in part, with hyperparameters under today's names."""
+    learner = data.get("learner")
+    return data | {"learner": current_names(learner, f"{where}: learner")} if isinstance(learner, dict) else data
 
 
 class ConfigFile(BaseModel):

@@ -11,12 +11,12 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 
 from qrl import tasks
-from qrl.config import Config, Count, CountOrZero
+from qrl.config import Config, current_names
 from qrl.runs.record import TaskRecord
 from qrl.sweep.axes import Axis, Range, axis, put, refuse_clashes, settable
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
-from qrl_envs.specfile import BadInput, Spec
+from qrl_envs.specfile import BadInput, Count, CountOrZero, Spec
 
 POINT_BYTES = 20_000  # of host memory for each point: read (6 kB measured), its arrays, its record in grid.json
 REPORT_BYTES = 3_000  # and for each report of a member: a row of some twenty numbers, once more as text
@@ -64,10 +64,10 @@ class GridPoint:
     @property
     def judged(self) -> dict[str, Any]:
         """How a report judges this point, as `evaluation()` of its environment and `fly` resolve it."""
-        flights = {"number of flights (report_flights)": self.learner.report_flights}
+        flights = {"number of flights (num_eval_envs)": self.learner.num_eval_envs}
         spec = self.task.spec
         if spec is None:
-            return flights | {"length of a flight (episode_steps)": self.learner.episode_steps}
+            return flights | {"length of a flight (episode_length)": self.learner.episode_length}
         plan = spec["evaluation"]
         return flights | {
             "control period of its flights": spec["control_period_s"],
@@ -109,7 +109,7 @@ class Grid:
 
 def load(path: Path, budget_bytes: float) -> Grid:
     """The grid in the file at `path`; refused where its points alone do not fit into the memory budget."""
-    file = specfile.build(GridFile, specfile.read(path), str(path))
+    file = specfile.build(GridFile, _with_current_names(specfile.read(path), str(path)), str(path))
     if len(set(file.seeds)) < len(file.seeds):
         raise BadInput(f"{path}: key 'seeds': expected each seed once, found {list(file.seeds)}")
     task = tasks.task_named(file.task, path)
@@ -119,7 +119,7 @@ def load(path: Path, budget_bytes: float) -> Grid:
     }
     refuse_clashes(file.fixed, axes, known, str(path))
     count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
-    reports = file.fixed.get("reports", tasks.task_preset(task, str(path))["reports"])
+    reports = file.fixed.get("num_evals", tasks.task_preset(task, str(path))["num_evals"])
     kept = (
         len(file.seeds)
         * REPORT_BYTES
@@ -144,6 +144,20 @@ def load(path: Path, budget_bytes: float) -> Grid:
         points[key] = point
         _refuse_other_judge(next(iter(points.values())), point, str(path))
     return Grid(file, axes, list(points.values()))
+
+
+def _with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
+    """A grid file's content with hyperparameters under today's names."""
+
+    def renamed(value: Any, key: str) -> Any:
+        return current_names(value, f"{where}: {key}") if isinstance(value, dict) else value
+
+    data = {key: renamed(value, key) if key in ("fixed", "axes") else value for key, value in data.items()}
+    if isinstance(axes := data.get("axes"), dict):
+        for name, settings in axes.items():
+            if isinstance(settings, dict):  # a range keeps its own keys: none of them is a former name
+                axes[name] = {key: renamed(value, f"axes.{name}.{key}") for key, value in settings.items()}
+    return data
 
 
 def _in_single(value: Any) -> str:

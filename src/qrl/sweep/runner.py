@@ -49,7 +49,7 @@ class Group:
     def steps(self) -> int:
         """Environment steps of one member."""
         config = self.trainer.config
-        return config.unrolls * config.unroll_size
+        return config.num_unrolls * config.steps_per_unroll
 
 
 class Result(NamedTuple):

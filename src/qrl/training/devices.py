@@ -38,7 +38,7 @@ def use_cores(run: RunConfig, before: Sequence[str], environment: MutableMapping
     elif count > 1:
         with suppress(RuntimeError):  # it was asked already, by a command before in this process
             jax.config.update("jax_num_cpu_devices", count)
-    if count == 1 and _work(run.learner) <= THREAD_WORK and run.learner.lanes <= DEVICE_LANES:
+    if count == 1 and _work(run.learner) <= THREAD_WORK and run.learner.num_envs <= DEVICE_LANES:
         environment["PJRT_NPROC"] = "1"  # what so little work gains by a second core, threads lose in waiting
 
 
@@ -46,8 +46,8 @@ def cpu_devices(learner: Config, seeds: int, cores: int) -> int:
     """As how many devices a run uses so many cores: each has a member of its own, or enough of one's work."""
     for count in range(cores, 1, -1):
         parts = count // math.gcd(seeds, count)  # of a member
-        much = _work(learner) >= parts * DEVICE_WORK or learner.lanes >= parts * DEVICE_LANES
-        if parts == 1 or (much and parts <= MOST_PARTS and learner.logical_shards % parts == 0):
+        much = _work(learner) >= parts * DEVICE_WORK or learner.num_envs >= parts * DEVICE_LANES
+        if parts == 1 or (much and parts <= MOST_PARTS and learner.shard_count % parts == 0):
             return count
     return 1
 
@@ -61,7 +61,11 @@ def _devices_said(environment: Mapping[str, str]) -> int:
 
 def _work(learner: Config) -> int:
     """Multiply-adds of an update's largest product."""
-    return learner.minibatch_lanes * learner.unroll_steps * max(*learner.policy_hidden, *learner.critic_hidden) ** 2
+    return (
+        learner.batch_size
+        * learner.unroll_length
+        * max(*learner.policy_hidden_layer_sizes, *learner.critic_hidden_layer_sizes) ** 2
+    )
 
 
 def workers() -> list[Any]:
@@ -97,7 +101,7 @@ def host_bytes() -> float:
 
 def devices(run: RunConfig) -> str:
     """What a run trains on here, in words."""
-    mesh = spread(jax.devices(), run.seeds, run.learner.logical_shards)
+    mesh = spread(jax.devices(), run.seeds, run.learner.shard_count)
     count, there = mesh.size if mesh else 1, jax.device_count()
     of = f" of {there}" if count < there else ""
     return f"{count}{of} {jax.default_backend()} device{'s' * (count > 1 or bool(of))}"
@@ -105,11 +109,11 @@ def devices(run: RunConfig) -> str:
 
 def check_devices(run: RunConfig) -> None:
     """Whether every one of several processes has a part in the run."""
-    mesh = spread(jax.devices(), run.seeds, run.learner.logical_shards)
+    mesh = spread(jax.devices(), run.seeds, run.learner.shard_count)
     if jax.process_count() > 1 and (mesh.size if mesh else 1) < jax.device_count():
         raise BadInput(
             f"key 'shards': expected shares that the processes' {jax.device_count()} devices can divide among them,"
-            f" found {run.learner.logical_shards}"
+            f" found {run.learner.shard_count}"
         )
 
 

@@ -64,7 +64,7 @@ def compile_advance(trainer: Trainer, states: TrainState, points: Point) -> Any:
 
 def compile_climb(trainer: Trainer, states: TrainState, points: Point) -> Any:
     """Of the run's last part; None where it has none."""
-    return trainer.climb.lower(states, points, np.int32(0)).compile() if trainer.config.climbs else None
+    return trainer.climb.lower(states, points, np.int32(0)).compile() if trainer.config.num_apg_updates else None
 
 
 def compile_fly(trainer: Trainer, states: TrainState, points: Point) -> Any:
@@ -77,7 +77,7 @@ def seeds(first: int, count: int) -> np.ndarray:
 
 def report_starts(config: Config) -> jax.Array:
     """Keys of the starts that every report of every run flies."""
-    return jax.random.split(jax.random.PRNGKey(REPORT_STARTS_SEED), config.report_flights)
+    return jax.random.split(jax.random.PRNGKey(REPORT_STARTS_SEED), config.num_eval_envs)
 
 
 def laps(
@@ -97,29 +97,37 @@ def laps(
     count, starts = len(states.unrolls), report_starts(config)
     began = time.perf_counter()
     chunk = 1
-    while done < config.unrolls and not hear(stopped()).any():
-        due = (done // config.unrolls_per_report + 1) * config.unrolls_per_report
-        report_at = config.whole(min(config.unrolls, due))
+    while done < config.num_unrolls and not hear(stopped()).any():
+        due = (done // config.unrolls_per_eval + 1) * config.unrolls_per_eval
+        report_at = config.align_to_apg_update(min(config.num_unrolls, due))
         learning = done < config.learning_unrolls
-        until = min(report_at, config.learning_unrolls if learning else config.unrolls, config.whole(done + chunk))
+        until = min(
+            report_at,
+            config.learning_unrolls if learning else config.num_unrolls,
+            config.align_to_apg_update(done + chunk),
+        )
         advance = programs.advance if learning else programs.climb()
         started = time.perf_counter()
         states = jax.block_until_ready(advance(states, points, np.int32(until)))
         lap = float(hear(time.perf_counter() - started)[multihost.FIRST])
         clock = Clock(clock.train_seconds + lap, clock.report_seconds + lap)
         chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))
-        speed = (until - done) * config.unroll_size * count / lap
+        speed = (until - done) * config.steps_per_unroll * count / lap
         done = until
-        left = (time.perf_counter() - began) * config.work(done, config.unrolls) / config.work(first, done)
+        left = (
+            (time.perf_counter() - began)
+            * config.estimated_cost(done, config.num_unrolls)
+            / config.estimated_cost(first, done)
+        )
         faults = _faults(programs.on_host((states.fault_update, states.fault_term)))
         rows: list[Row] = []
         if done == report_at:
             flights = programs.on_host(programs.fly(states.learner, points, starts))
             updates, totals = programs.on_host((states.learner.updates, states.totals))
-            rows = _rows(config, done * config.unroll_size, updates, totals, flights, clock)
+            rows = _rows(config, done * config.steps_per_unroll, updates, totals, flights, clock)
             clock = clock._replace(report_seconds=0.0)
             states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
-        yield Lap(states, done * config.unroll_size, speed, left, clock, rows, faults)
+        yield Lap(states, done * config.steps_per_unroll, speed, left, clock, rows, faults)
 
 
 def _faults(found: tuple[np.ndarray, np.ndarray]) -> list[str]:

@@ -114,7 +114,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
     Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept. Where a run
     has several processes, the first alone reads and writes.
     """
-    trainer = Trainer(env, run.learner, spread(jax.devices(), run.seeds, run.learner.logical_shards))
+    trainer = Trainer(env, run.learner, spread(jax.devices(), run.seeds, run.learner.shard_count))
     points = stack([point(env, run.learner)] * run.seeds)
     folders = runs.members(out, run) if multihost.first() else []
     configs = [run.member(i) for i in range(run.seeds)]
@@ -156,7 +156,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
             states, begin = lap.states, lap.env_steps
             yield saver.heed(lap)
         saver.end()
-        if begin == run.learner.unrolls * run.learner.unroll_size:
+        if begin == run.learner.num_unrolls * run.learner.steps_per_unroll:
             flights = programs.on_host(programs.fly(states.learner, points, report_starts(run.learner)))
             yield Finished(flights, [member.rows for member in members])
     finally:

@@ -43,7 +43,7 @@ class Trainer:
         self.env = env
         self.config = config
         self.mesh = mesh
-        self.longest = rollout.episode_steps(env, config.episode_steps)
+        self.longest = rollout.episode_steps(env, config.episode_length)
         sizes = int(env.observation_size), env.action_size  # pyright: ignore[reportArgumentType]
         self.learner = Learner(config, *sizes, SHARD if mesh else None)
         init = self._over_mesh(self._init_all, (P(MEMBER), P(MEMBER)), LAYOUT)
@@ -154,11 +154,11 @@ class Trainer:
     def _init(self, seed: chex.Array, point: Point) -> TrainState:
         learner, env = self._under(point)
         learner_key, starts, key = jax.random.split(jax.random.PRNGKey(seed), 3)
-        count = self.config.lanes
-        lanes = rollout.begin(env, starts, self._share(count), count, self.longest, self.config.unroll_steps)
+        count = self.config.num_envs
+        lanes = rollout.begin(env, starts, self._share(count), count, self.longest, self.config.unroll_length)
         first = learner.init(learner_key)
         _, transitions = jax.eval_shape(lambda *now: self._collect(learner, *now), first, lanes, key, starts)
-        ring = replay_buffer.create(transitions, self.config.ring_unrolls)
+        ring = replay_buffer.create(transitions, self.config.replay_unrolls)
         zero = jnp.float32(0.0)
         totals = Totals(zero, zero, zero, zero, zero, Terms(*[zero] * len(Terms._fields)))
         state = TrainState(first, ring, lanes, key, starts, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
@@ -175,7 +175,7 @@ class Trainer:
             learner.sigma(state),
             key,
             starts,
-            unroll_steps=self.config.unroll_steps,
+            unroll_length=self.config.unroll_length,
             longest=self.longest,
         )
 
@@ -188,10 +188,10 @@ class Trainer:
     def _climb(self, state: TrainState, point: Point, until: chex.Array) -> TrainState:
         """Go on until `until` unrolls by the analytic gradient; an update stands for as many as its flights take."""
         config, (learner, env) = self.config, self._under(point)
-        lanes = self._share(config.apg_lanes)
+        lanes = self._share(config.apg_num_envs)
 
         def climbed(unrolls: chex.Array) -> chex.Array:
-            return (unrolls - config.learning_unrolls) // config.unrolls_per_climb
+            return (unrolls - config.learning_unrolls) // config.unrolls_per_apg_update
 
         def climb(i: chex.Array, state: TrainState) -> TrainState:
             key = jax.random.fold_in(state.key, config.learning_unrolls + i)
@@ -199,14 +199,16 @@ class Trainer:
 
             def flown(now: LearnerState) -> tuple[chex.Array, chex.Array]:
                 noise = learner.sigma(now) * learner.left(i)
-                return analytic_gradient.returns(env, lambda o: learner.mean(now, o), noise, keys, config.apg_steps)
+                return analytic_gradient.returns(
+                    env, lambda o: learner.mean(now, o), noise, keys, config.apg_episode_length
+                )
 
             now, terms, (rewards, whole) = learner.climb(state.learner, flown, i)
             seen = Totals(
                 rewards=rewards,
-                steps=whole * config.apg_steps,
-                episodes=jnp.float32(config.apg_lanes),
-                early=config.apg_lanes - whole,
+                steps=whole * config.apg_episode_length,
+                episodes=jnp.float32(config.apg_num_envs),
+                early=config.apg_num_envs - whole,
                 updates=jnp.float32(1.0),
                 terms=terms,
             )
@@ -256,9 +258,9 @@ class Trainer:
             return now, jnp.stack(terms)
 
         def learn(now: LearnerState) -> tuple[LearnerState, chex.Array]:
-            shards = self.config.logical_shards
+            shards = self.config.shard_count
             keys = jax.vmap(lambda shard: jax.random.fold_in(learn_key, shard))(self._share(shards))
-            each = self.config.minibatch_lanes // shards
+            each = self.config.batch_size // shards
             index = replay_buffer.draw(ring, keys, self.config.updates_per_unroll, each)
             return jax.lax.scan(update, now, (index, self._turns(keys, index)))
 
@@ -281,7 +283,7 @@ class Trainer:
         fresh = (state.fault_update < 0) & (fault_update >= 0)
         seen = Totals(
             rewards=sums[0],
-            steps=jnp.float32(self.config.unroll_size),
+            steps=jnp.float32(self.config.steps_per_unroll),
             episodes=sums[1],
             early=sums[2],
             updates=(learned.updates - observed.updates).astype(jnp.float32),
