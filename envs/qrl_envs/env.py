@@ -2,7 +2,7 @@
 
 `state.pipeline_state` is a `Lane`: the lane's own task (physics, reward weights, start ranges, bounds) travels
 with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` offers `restart` (a
-fresh start that keeps the lane's task), `under` (the same world with other parameters) and `evaluation`. An
+fresh start that keeps the lane's task), `with_params` (the same world with other parameters) and `evaluation`. An
 episode that ends early by leaving the bounds has `done = 1`, and `truncated = 1` and `out_of_bounds = 1` in `info`:
 whoever bootstraps should treat it as a truncation, and should not trust a value function there.
 """
@@ -89,7 +89,13 @@ class TaskEnv(abc.ABC):
     def episode_steps(self) -> int:
         return self.task.episode_steps
 
-    def under(self, params: Params) -> "TaskEnv":
+    @property
+    def control_period_s(self) -> float:
+        return self.task.control_period_s
+
+    differentiable = True  # step and reward
+
+    def with_params(self, params: Params) -> "TaskEnv":
         """This environment with other parameters of the same structure, which may be tracers."""
         other = copy.copy(self)
         other.params = params
@@ -99,7 +105,7 @@ class TaskEnv(abc.ABC):
         """A fresh start drawn with `rng` (a legacy or typed key)."""
         return self._begin(self.params, rng)
 
-    def meet(self, rng: chex.PRNGKey) -> State:
+    def reset_calibration(self, rng: chex.PRNGKey) -> State:
         """A start from the envelope that a policy has to cope with once it leaves the simulator."""
         return self.reset(rng)
 
@@ -160,7 +166,7 @@ class QuadrotorEnv(TaskEnv):
         params = Params(quadrotor.physics(task.vehicle), reward, quadrotor.start(task.start), bounds)
         super().__init__(task, params, observation_size=18, action_size=4)
 
-    def meet(self, rng: chex.PRNGKey) -> State:
+    def reset_calibration(self, rng: chex.PRNGKey) -> State:
         return self._begin(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
 
     def _draw(self, params: Params, rng: chex.PRNGKey) -> quadrotor.Body:
@@ -186,7 +192,7 @@ class QuadrotorEnv(TaskEnv):
     def evaluation(self) -> Evaluation:
         spec, dt_s = self.task.evaluation, self.task.control_period_s
         judged = {"start": quadrotor.start(spec.start), "reward": rewards.from_spec(spec.reward)}
-        env = self.under(self.params._replace(**judged))
+        env = self.with_params(self.params._replace(**judged))
 
         def measure(observations: chex.Array) -> dict[str, chex.Array]:
             if spec.reward.form == "hover":
@@ -233,7 +239,7 @@ class PendulumEnv(TaskEnv):
             params = params._replace(start=pendulum.start(spec.start))
         if spec.reward:
             params = params._replace(reward=rewards.from_spec(spec.reward))
-        return Evaluation(self.under(params), round(spec.duration_s / dt_s), self.task.episode_steps, measure)
+        return Evaluation(self.with_params(params), round(spec.duration_s / dt_s), self.task.episode_steps, measure)
 
 
 def from_task(task: Task) -> TaskEnv:

@@ -97,7 +97,7 @@ def flights(env: Any) -> Callable[[Policy], dict[str, float]]:
     fly = jax.jit(
         lambda act, params: evaluate.fly(env, partial(act, params), keys, env.episode_steps), static_argnums=0
     )
-    return lambda policy: evaluate.summarise(fly(*policy))
+    return lambda policy: evaluate.summarize(fly(*policy))
 
 
 def learn(task: str, seed: int, steps: int, settings: dict[str, Any], judge: Judge, every: int) -> None:

@@ -14,13 +14,14 @@ import numpy as np
 
 from judge import Act, Judge, pendulum_judge, success_judge
 from qrl import request, tasks
-from qrl.algorithm.flights import summarise
+from qrl.algorithm import learner
+from qrl.algorithm.flights import summarize
 from qrl.config import load_preset, preset_names
 from qrl.runs import record
 from qrl.training import devices, driver
-from qrl.training.sharding import spread
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.sharding import make_mesh
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import Trainer, make_trainer
 
 STARTS, EVALUATION_STARTS_SEED = 1000, 1_000_003  # those of `qrl evaluate`
 
@@ -32,16 +33,20 @@ def contestant(
     fast = f"{task}_fast"
     name = preset or (fast if fast in preset_names() else task)
     run = request.run_config(task, None, record.ConfigFile(learner=load_preset(name)), flags, seed, 1)
-    devices.use_cores(run, [])
+    devices.configure_cpu(run, [])
     env = tasks.environment(run.task)
-    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.shard_count))
-    return trainer, stack([point(env, run.learner)]), run
+    trainer = make_trainer(env, run.learner, make_mesh(jax.devices(), 1, run.learner.shard_count))
+    return trainer, stack([member_inputs(env, run.learner)]), run
 
 
 def pendulum_judged(trainer: Trainer) -> Callable[[Any], Act]:
     """The policy that ships as a function of observations in NumPy; compiled once."""
-    learner = trainer.learner
-    mean = jax.jit(lambda state, o: jnp.clip(learner.mean(learner.shipped(state), o), -1.0, 1.0))
+    spec, hyper = trainer.setup.spec, trainer.config.hyperparameters
+
+    @jax.jit
+    def mean(state: Any, o: Any) -> Any:
+        return jnp.clip(learner.policy_mean(spec, hyper, learner.deployed(spec, state), o), -1.0, 1.0)
+
     return lambda member: lambda observation: np.asarray(mean(member, jnp.asarray(observation, jnp.float32)))
 
 
@@ -59,13 +64,13 @@ def main() -> None:
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
 
     def flights(learners: Any) -> dict[str, float]:
-        return summarise(jax.tree.map(lambda x: x[0], trainer.fly(learners, points, keys)))
+        return summarize(jax.tree.map(lambda x: x[0], trainer.fly(learners, points, keys)))
 
     judge: Judge = pendulum_judge() if args.task == "pendulum" else success_judge(flights)
     judged = pendulum_judged(trainer)
     judge.hear_jax().start()
     states = trainer.init(driver.seeds(run.seed, 1), points)
-    advance, climb = driver.compile_advance(trainer, states, points), driver.compile_climb(trainer, states, points)
+    advance, climb = driver.compile_train(trainer, states, points), driver.compile_apg(trainer, states, points)
     pieces = min(args.checks, config.num_unrolls)
     for until in sorted(
         {round(config.num_unrolls * (i + 1) / pieces) for i in range(pieces)} | {config.learning_unrolls}
@@ -73,9 +78,7 @@ def main() -> None:
         on = advance if until <= config.learning_unrolls else climb
         states = jax.block_until_ready(on(states, points, np.int32(until)))
         learners = states.learner
-        policy = (
-            judged(jax.tree.map(lambda x: x[0], trainer.on_host(learners))) if args.task == "pendulum" else learners
-        )
+        policy = judged(jax.tree.map(lambda x: x[0], trainer.gather(learners))) if args.task == "pendulum" else learners
         if judge.check(until * config.steps_per_unroll, policy):
             break
 

@@ -10,8 +10,8 @@ from qrl import tasks
 from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED
 from qrl.runs import record
 from qrl.training import restore
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs.perturbations import OffNominal, conditions
 from qrl_envs.task import QuadrotorTask
 
@@ -42,10 +42,11 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     task = tasks.spec(config.task)
     assert isinstance(task, QuadrotorTask)
     one = config.member(0)
-    trainer, learner, env_steps = restore.last(tasks.environment(config.task), one, record.members(folder, config)[0])
+    trainer = make_trainer(tasks.environment(config.task), config.learner)
+    learner, env_steps = next(restore.iter_learners(trainer.setup.spec, one, record.members(folder, config)[0], 1))
     if trial:
-        trainer = Trainer(OffNominal(task, conditions(task)["trial"]), config.learner)
+        trainer = make_trainer(OffNominal(task, conditions(task)["trial"]), config.learner)
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)[:starts]
-    found = trainer.fly(learner, stack([point(trainer.env, config.learner)]), keys)
+    found = trainer.fly(learner, stack([member_inputs(trainer.setup.env, config.learner)]), keys)
     found = jax.tree.map(lambda x: np.asarray(x)[0], found)
     return Flown(one.seed, env_steps, task, found.observations, found.measures)

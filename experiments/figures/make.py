@@ -25,7 +25,7 @@ from experiments.figures.flights import Flown, flown
 from experiments.figures.plots import SHOWN, Curves, Rate
 from experiments.figures.runs import PAPER_RATES, Failed, Wanted, current, make, reports, wanted
 from qrl import tasks
-from qrl.algorithm.rollout import episode_steps
+from qrl.algorithm.adapter import adapt
 from qrl.cli.terminal import DONE, FAILED
 from qrl.runs import files, record
 from qrl_envs.specfile import BadInput, nearest
@@ -122,7 +122,7 @@ def drawn(name: str, sources: list[Source], fly: "functools._lru_cache_wrapper[F
         return draw.hover(found), captions.hover(found)
     if name == "circle":
         found, config = curves(sources[0]), tasks.load_run_config(first)
-        longest = episode_steps(tasks.environment(config.task), config.learner.episode_length)
+        longest = config.learner.episode_length or adapt(tasks.environment(config.task)).episode_steps
         return draw.circle(found), captions.circle(found, longest)
     if name == "hover_trial":
         flights = fly(first, trial=True)

@@ -10,14 +10,12 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 
-from qrl.algorithm import replay_buffer, rollout
-from qrl.algorithm.learner import Learner
+from qrl.algorithm import augmentation, learner, replay_buffer, rollout
 from qrl.algorithm.types import Networks, Transition
 from qrl.algorithm.vtrace import vtrace
-from qrl.training.state import Point, TrainState
-from qrl.training.trainer import Trainer
+from qrl.training.state import MemberInputs, TrainState
+from qrl.training.trainer import Trainer, collect
 
 REPEATED = 20  # times, within a timed call
 
@@ -26,7 +24,7 @@ class Now(NamedTuple):
     """What the parts are made from: arguments of their programs, so that nothing of it is known when they compile."""
 
     state: TrainState  # one member's
-    point: Point
+    point: MemberInputs
     minibatches: chex.Array  # [REPEATED, B] trajectories of minibatches
     turns: chex.Array  # [REPEATED, B, 2] their symmetries
     batch: Transition  # leaves [B, T, ...]
@@ -49,21 +47,23 @@ class Part(NamedTuple):
     first: Any = None  # what the first time finds as its `last`; None: zeros
 
 
-def now_of(trainer: Trainer, states: TrainState, points: Point) -> Now:
+def now_of(trainer: Trainer, states: TrainState, points: MemberInputs) -> Now:
     """Copies of what the parts need of a run of one member: the run may go on, and donate its states."""
     one, here = jax.tree.map(lambda x: jnp.array(x[0]), (states, points))
     shards = trainer.config.shard_count
     keys = jax.random.split(jax.random.PRNGKey(0), shards)
-    index = replay_buffer.draw(one.ring, keys, REPEATED, trainer.config.batch_size // shards)
-    return Now(one, here, index, trainer._turns(keys, index), replay_buffer.gather(one.ring, index[0]))
+    index = replay_buffer.sample(one.buffer, keys, REPEATED, trainer.config.batch_size // shards)
+    return Now(
+        one,
+        here,
+        index,
+        augmentation.sample(keys, REPEATED, trainer.config.batch_size // shards),
+        replay_buffer.gather(one.buffer, index[0]),
+    )
 
 
 def parts(trainer: Trainer, now: Now) -> list[Part]:
     return [*acting_parts(trainer, now), *minibatch_parts(trainer, now), *update_parts(trainer, now)]
-
-
-def learner_of(trainer: Trainer, now: Now) -> Learner:
-    return trainer._under(now.point)[0]
 
 
 def slightly(tree: Any, tiny: chex.Array) -> Any:
@@ -72,9 +72,9 @@ def slightly(tree: Any, tiny: chex.Array) -> Any:
 
 def pass_adds(trainer: Trainer) -> tuple[int, int]:
     """Multiply-adds of one pass of the policy, and of the critic."""
-    config, inputs = trainer.config, trainer.learner.observation_size
+    config, inputs = trainer.config, trainer.setup.spec.observation_size
     policy, critic = (
-        [inputs, *config.policy_hidden_layer_sizes, trainer.env.action_size],
+        [inputs, *config.policy_hidden_layer_sizes, trainer.setup.env.action_size],
         [inputs, *config.critic_hidden_layer_sizes, 1],
     )
     return layers(policy), layers(critic)
@@ -89,7 +89,7 @@ def layers(sizes: list[int]) -> int:
 
 def acting_parts(trainer: Trainer, now: Now) -> list[Part]:
     adds = pass_adds(trainer)[0] * trainer.config.steps_per_unroll
-    slot = jax.tree.map(lambda x: x[0], now.state.ring.data)
+    slot = jax.tree.map(lambda x: x[0], now.state.buffer.data)
     return [
         Part("acting", acted, adds=adds, first=(now.state.lanes, slot)),
         Part("– policy", policy_alone, adds=adds),
@@ -102,30 +102,37 @@ def acting_parts(trainer: Trainer, now: Now) -> list[Part]:
 def acted(trainer: Trainer, turn: Turn) -> Any:
     lanes, _ = turn.last
     state, key = turn.now.state, jax.random.fold_in(turn.now.state.key, turn.i)
-    return trainer._collect(learner_of(trainer, turn.now), state.learner, lanes, key, state.starts)
+    return collect(trainer.setup, turn.now.point.hyper, state.learner, lanes, key, state.start_key)
 
 
 def unrolled(trainer: Trainer, now: Now) -> Any:
     """The newest unroll's observations and actions, [T, N, ...]."""
-    newest = (now.state.ring.inserted - 1) % trainer.config.replay_unrolls
-    data: Any = now.state.ring.data
+    newest = (now.state.buffer.inserted - 1) % trainer.config.replay_unrolls
+    data: Any = now.state.buffer.data
     return [jnp.swapaxes(x[newest], 0, 1) for x in (data.observation, data.action)]
 
 
 def policy_alone(trainer: Trainer, turn: Turn) -> Any:
-    learner, state = learner_of(trainer, turn.now), turn.now.state.learner
+    state, hyper = turn.now.state.learner, turn.now.point.hyper
     state = state._replace(params=slightly(state.params, turn.tiny))
-    return jax.lax.scan(lambda _, o: (None, learner.mean(state, o)), None, unrolled(trainer, turn.now)[0])[1]
+
+    def step(_: None, observation: chex.Array) -> Any:
+        return None, learner.policy_mean(trainer.setup.spec, hyper, state, observation)
+
+    return jax.lax.scan(step, None, unrolled(trainer, turn.now)[0])[1]
 
 
 def noise(trainer: Trainer, turn: Turn) -> Any:
-    key, shape = jax.random.fold_in(turn.now.state.key, turn.i), (trainer.config.unroll_length, trainer.env.action_size)
-    return jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), shape))(turn.now.state.lanes.number)
+    key, shape = (
+        jax.random.fold_in(turn.now.state.key, turn.i),
+        (trainer.config.unroll_length, trainer.setup.env.action_size),
+    )
+    return jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), shape))(turn.now.state.lanes.lane_id)
 
 
 def physics(trainer: Trainer, turn: Turn) -> Any:
     def step(state: Any, action: chex.Array) -> Any:
-        state = jax.vmap(trainer.env.step)(state, jnp.clip(action, -1.0, 1.0))
+        state = jax.vmap(trainer.setup.env.step)(state, jnp.clip(action, -1.0, 1.0))
         return state, (state.obs, state.reward, state.done)
 
     return jax.lax.scan(step, turn.now.state.lanes.state, unrolled(trainer, turn.now)[1] + turn.tiny)
@@ -133,8 +140,8 @@ def physics(trainer: Trainer, turn: Turn) -> Any:
 
 def starts(trainer: Trainer, turn: Turn) -> Any:
     over, lanes = jnp.ones(trainer.config.num_envs, bool), turn.now.state.lanes
-    lanes = lanes._replace(ended=over, used=over, start=lanes.start + turn.i)
-    return rollout._restart(trainer.env, lanes, turn.now.state.starts)
+    lanes = lanes._replace(done=over, next_state_used=over, reset_count=lanes.reset_count + turn.i)
+    return rollout.restart(trainer.setup.env, lanes, turn.now.state.start_key)
 
 
 # -- from an unroll to minibatches ---------------------------------------------------------------------------
@@ -143,7 +150,7 @@ def starts(trainer: Trainer, turn: Turn) -> Any:
 def minibatch_parts(trainer: Trainer, now: Now) -> list[Part]:
     updates = trainer.config.updates_per_unroll
     return [
-        Part("ring: insert", inserted, first=now.state.ring),
+        Part("ring: insert", inserted, first=now.state.buffer),
         Part("draws of minibatches and symmetries", drawn),
         Part("ring: gather", gathered, updates),
         Part("symmetries", turned, updates),
@@ -151,7 +158,7 @@ def minibatch_parts(trainer: Trainer, now: Now) -> list[Part]:
 
 
 def inserted(trainer: Trainer, turn: Turn) -> Any:
-    slot = jax.tree.map(lambda x: x[0], turn.now.state.ring.data)
+    slot = jax.tree.map(lambda x: x[0], turn.now.state.buffer.data)
     return replay_buffer.add(turn.last, slightly(slot, turn.tiny))
 
 
@@ -159,16 +166,16 @@ def drawn(trainer: Trainer, turn: Turn) -> Any:
     config, state = trainer.config, turn.now.state
     shards = config.shard_count
     keys = jax.vmap(lambda shard: jax.random.fold_in(jax.random.fold_in(state.key, turn.i), shard))(jnp.arange(shards))
-    index = replay_buffer.draw(state.ring, keys, config.updates_per_unroll, config.batch_size // shards)
-    return index, trainer._turns(keys, index)
+    index = replay_buffer.sample(state.buffer, keys, config.updates_per_unroll, config.batch_size // shards)
+    return index, augmentation.sample(keys, config.updates_per_unroll, config.batch_size // shards)
 
 
 def gathered(trainer: Trainer, turn: Turn) -> Any:
-    return replay_buffer.gather(turn.now.state.ring, turn.now.minibatches[turn.i])
+    return replay_buffer.gather(turn.now.state.buffer, turn.now.minibatches[turn.i])
 
 
 def turned(trainer: Trainer, turn: Turn) -> Any:
-    after = trainer._turned(trainer.env, turn.now.batch, turn.now.turns[turn.i])
+    after = augmentation.augment(trainer.setup.env, turn.now.batch, turn.now.turns[turn.i])
     return after.observation + turn.tiny, after.next_observation + turn.tiny, after.action + turn.tiny
 
 
@@ -176,16 +183,16 @@ def turned(trainer: Trainer, turn: Turn) -> Any:
 
 
 def update_parts(trainer: Trainer, now: Now) -> list[Part]:
-    config, learner, state = trainer.config, trainer.learner, now.state.learner
+    config, spec, state = trainer.config, trainer.setup.spec, now.state.learner
     updates, size = config.updates_per_unroll, now.batch.reward.size
     policy, critic = pass_adds(trainer)
     # Backwards: as much again for the weights, and for the inputs of all layers but the first.
-    backwards = 2 * (policy + critic) - learner.observation_size * (
+    backwards = 2 * (policy + critic) - spec.observation_size * (
         config.policy_hidden_layer_sizes[0] + config.critic_hidden_layer_sizes[0]
     )
-    terms = jax.eval_shape(learner.update, state, now.batch)[1]
+    terms = jax.eval_shape(lambda *x: learner.update(spec, now.point.hyper, *x), state, now.batch)[1]
     no_terms = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), terms)
-    step = [(p, o, jnp.float32(0.0)) for p, o in zip(state.params, state.optimiser, strict=True)]
+    step = [(p, o, jnp.float32(0.0)) for p, o in zip(state.params, state.optimizer, strict=True)]
     return [
         Part("update", updated, updates, (policy + critic + backwards) * size, first=(state, no_terms)),
         Part("– policy forward", policy_forward, updates, policy * size),
@@ -196,39 +203,34 @@ def update_parts(trainer: Trainer, now: Now) -> list[Part]:
 
 
 def updated(trainer: Trainer, turn: Turn) -> Any:
-    return learner_of(trainer, turn.now).update(turn.last[0], slightly(turn.now.batch, turn.tiny))
+    batch = slightly(turn.now.batch, turn.tiny)
+    return learner.update(trainer.setup.spec, turn.now.point.hyper, turn.last[0], batch)
 
 
 def policy_forward(trainer: Trainer, turn: Turn) -> Any:
-    return trainer.learner.policy.apply(turn.now.state.learner.params.policy, scaled(trainer, turn))
+    return trainer.setup.spec.policy.apply(turn.now.state.learner.params.policy, scaled(trainer, turn))
 
 
 def critic_forward(trainer: Trainer, turn: Turn) -> Any:
-    return trainer.learner.critic.apply(turn.now.state.learner.params.critic, scaled(trainer, turn))
+    return trainer.setup.spec.critic.apply(turn.now.state.learner.params.critic, scaled(trainer, turn))
 
 
 def scaled(trainer: Trainer, turn: Turn) -> chex.Array:
     """The minibatch's observations as the networks see them, [B·T, F]."""
-    learner, observation = learner_of(trainer, turn.now), turn.now.batch.observation
-    return learner.scale(turn.now.state.learner, observation.reshape(-1, observation.shape[-1])) + turn.tiny
+    flat = turn.now.batch.observation.reshape(-1, turn.now.batch.observation.shape[-1])
+    return learner.preprocess(trainer.setup.spec, turn.now.point.hyper, turn.now.state.learner, flat) + turn.tiny
 
 
 def traced(trainer: Trainer, turn: Turn) -> Any:
-    hyper, batch = learner_of(trainer, turn.now).hyper, turn.now.batch
-    clips = {name: hyper[name] for name in ("gamma", "lam", "rho_bar", "c_bar")}
+    hyper, batch = turn.now.point.hyper, turn.now.batch
+    clips = {name: getattr(hyper, name) for name in ("gamma", "lam", "rho_bar", "c_bar")}
     value, rho = batch.log_mu + turn.tiny, jnp.exp(batch.log_mu + turn.tiny)
     trajectories = batch.reward, value, value + 1.0, batch.terminated, batch.truncated, rho
     return jax.vmap(lambda *x: vtrace(*x, **clips))(*trajectories)
 
 
 def stepped(trainer: Trainer, turn: Turn) -> Any:
-    optimiser: Any = learner_of(trainer, turn.now)._optimiser
-
-    def descend(params: Any, gradient: Any, opt: Any) -> Any:  # as within Learner.update
-        flat, whole = ravel_pytree(gradient)
-        direction, opt = optimiser.update(flat, opt)
-        norm = jnp.linalg.norm(flat)
-        return jax.tree.map(lambda p, d: p - 1e-6 * d, params, whole(direction)), opt, norm
-
+    hyper, rate = turn.now.point.hyper, jnp.float32(1e-6)
     gradient: Networks = slightly(turn.now.state.learner.params, turn.tiny)
-    return [descend(p, g, o) for (p, o, _), g in zip(turn.last, gradient, strict=True)]
+    pairs = zip(turn.last, gradient, strict=True)
+    return [learner.apply_gradient(hyper, params, g, optimizer, rate) for (params, optimizer, _), g in pairs]

@@ -21,25 +21,25 @@ from experiments.profiling.parts import REPEATED, Now, Part, Turn, now_of, parts
 from qrl import request, tasks
 from qrl.runs import record
 from qrl.training import driver
-from qrl.training.state import Point, TrainState, point, stack
-from qrl.training.trainer import Trainer, xla_effort
+from qrl.training.state import MemberInputs, TrainState, member_inputs, stack
+from qrl.training.trainer import Trainer, make_trainer, xla_effort
 
 WHOLE = 4  # unrolls of the whole, within a timed call
 
 
-def begun(task: str) -> tuple[Trainer, Point, TrainState, Callable[..., TrainState]]:
+def begun(task: str) -> tuple[Trainer, MemberInputs, TrainState, Callable[..., TrainState]]:
     """A run of one member whose ring is full: trainer, points, states, and what advances them."""
     run = request.run_config(task, None, record.ConfigFile(), {}, 0, 1)
     os.environ.setdefault("PJRT_NPROC", "1")  # each device has about a core
     env, config = tasks.environment(run.task), run.learner
-    trainer, points = Trainer(env, config), stack([point(env, config)])
+    trainer, points = make_trainer(env, config), stack([member_inputs(env, config)])
     states = trainer.init(driver.seeds(0, 1), points)
-    advance = driver.compile_advance(trainer, states, points)
+    advance = driver.compile_train(trainer, states, points)
     states = advance(states, points, np.int32(min(config.num_unrolls, 2 * config.replay_unrolls)))
     return trainer, points, jax.block_until_ready(states), advance
 
 
-def going_on(advance: Callable[..., TrainState], states: TrainState, points: Point) -> Callable[[], None]:
+def going_on(advance: Callable[..., TrainState], states: TrainState, points: MemberInputs) -> Callable[[], None]:
     """WHOLE unrolls more, at each call."""
     box = [states]
 

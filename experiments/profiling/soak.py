@@ -35,7 +35,7 @@ def main() -> int:
     reports = max(4, round(args.steps / REPORT_STEPS))
     long = {"num_timesteps": args.steps, "num_evals": reports, "apg_fraction": 0.0}
     run = request.run_config("hover", None, record.ConfigFile(), long, 0, 1)
-    devices.use_cores(run, [])
+    devices.configure_cpu(run, [])
     if args.out.exists():
         print(f"{args.out}: exists already; give another --out", file=sys.stderr)
         return 2

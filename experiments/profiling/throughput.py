@@ -33,9 +33,9 @@ from qrl import request, tasks
 from qrl.algorithm import replay_buffer, rollout
 from qrl.runs import record
 from qrl.training import devices, driver
-from qrl.training.sharding import LAYOUT, MEMBER, SHARD, spread
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer, xla_effort
+from qrl.training.sharding import LAYOUT, MEMBER, SHARD, make_mesh, shard_map
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import Trainer, collect, make_trainer, xla_effort
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from rates import LANES, TRAINING, UNROLL_STEPS, rate
@@ -58,26 +58,25 @@ def acting(lanes: int, key: jax.Array) -> None:
 
     def act(members: Any, carry: Any, key: Any) -> Any:
         (learner, starts, here), mine = jax.tree.map(lambda x: x[0], (members, carry))
-        under, _ = trainer._under(here)
 
         def unroll(i: Any, mine: Any) -> Any:
             now, ring = mine
-            now, seen = trainer._collect(under, learner, now, jax.random.fold_in(key, i), starts)
+            now, seen = collect(trainer.setup, here.hyper, learner, now, jax.random.fold_in(key, i), starts)
             return now, replay_buffer.add(ring, seen)
 
         return jax.tree.map(lambda x: x[None], jax.lax.fori_loop(0, unrolls, unroll, mine))
 
-    places = LAYOUT.lanes, LAYOUT.ring
-    program = trainer._over_mesh(act, (P(MEMBER), places, P()), places)
+    places = LAYOUT.lanes, LAYOUT.buffer
+    program = shard_map(trainer.setup.mesh, act, (P(MEMBER), places, P()), places)
     acted = jax.jit(program, donate_argnums=1, compiler_options=xla_effort(1))
-    members = states.learner, states.starts, points
+    members = states.learner, states.start_key, points
 
     def on(carry: Any) -> Any:
         mine, key = carry
         key, now = jax.random.split(key)
         return acted(members, mine, now), key
 
-    first = (states.lanes, states.ring), key
+    first = (states.lanes, states.buffer), key
     rate(f"acting, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, on, first, jax.block_until_ready)
 
 
@@ -85,7 +84,7 @@ def physics(lanes: int, key: jax.Array) -> None:
     env = worlds.make("hover")
     params: Any = env.params
     dt_s = env.task.control_period_s
-    mesh = spread(jax.devices(), 1, hover(num_envs=lanes).learner.shard_count)
+    mesh = make_mesh(jax.devices(), 1, hover(num_envs=lanes).learner.shard_count)
     blocks = max(mesh.size if mesh else 1, lanes // rollout.BLOCK_LANES)
     unrolls = max(1, LANES[-1] // lanes)
 
@@ -133,7 +132,7 @@ def training(unroll_length: int, key: jax.Array) -> None:
 def advancing(figure: str, run: record.RunConfig, unrolls: int, counted: int) -> None:
     """How much of what is `counted` in so many unrolls the training loop does."""
     trainer, states, points = begun(run)
-    advance = driver.compile_advance(trainer, states, points)
+    advance = driver.compile_train(trainer, states, points)
     full = run.learner.replay_unrolls
     states = advance(states, points, np.int32(full))
 
@@ -146,8 +145,8 @@ def advancing(figure: str, run: record.RunConfig, unrolls: int, counted: int) ->
 
 def begun(run: record.RunConfig) -> tuple[Trainer, Any, Any]:
     env = tasks.environment(run.task)
-    trainer = Trainer(env, run.learner, spread(jax.devices(), 1, run.learner.shard_count))
-    points = stack([point(env, run.learner)])
+    trainer = make_trainer(env, run.learner, make_mesh(jax.devices(), 1, run.learner.shard_count))
+    points = stack([member_inputs(env, run.learner)])
     return trainer, trainer.init(driver.seeds(0, 1), points), points
 
 
@@ -164,7 +163,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=ROWS, default=list(ROWS))
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    devices.use_cores(hover(), [])
+    devices.configure_cpu(hover(), [])
     for name in args.only:
         measure, sizes = ROWS[name]
         for size in sizes:

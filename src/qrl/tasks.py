@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.types import Env
 from qrl.config import Config, load_preset
 from qrl.runs.record import RunConfig, TaskRecord, with_current_names
@@ -108,7 +109,7 @@ def check(env: Env, learner: Config, where: str) -> None:
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
     except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on
         raise BadInput(f"{where}: this environment does not work with jax {jax.__version__}: {error}") from None
-    if learner.num_apg_updates and not hasattr(env, "evaluation"):  # ours are differentiable
+    if learner.num_apg_updates and not adapt(env).differentiable:
         try:
             jax.eval_shape(
                 jax.grad(lambda action: env.step(env.reset(jax.random.PRNGKey(0)), action).reward.sum()),

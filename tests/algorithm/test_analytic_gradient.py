@@ -12,15 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+from bound_learner import BoundLearner
 from fault_injection import assert_same_leaves, leaves
 from qrl import tasks
 from qrl.algorithm import analytic_gradient
-from qrl.algorithm.learner import Learner, LearnerState
+from qrl.algorithm.learner import LearnerState
 from qrl.config import Config, load_preset, preset_names
 from qrl.runs import checkpoint, files
 from qrl.training import driver
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 from small_run import comparable_metrics, run_config, train
@@ -115,13 +116,13 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
     np.testing.assert_array_equal(jax.grad(mean_return)(outward), 0.0)
 
 
-def learner(**changes: object) -> Learner:
+def learner(**changes: object) -> BoundLearner:
     preset = load_preset("default") | {
         "normalize_observations": False,
         "policy_hidden_layer_sizes": [8],
         "critic_hidden_layer_sizes": [8],
     }
-    return Learner(Config.model_validate(preset | {"apg_fraction": 0.5} | changes, strict=False), 2, 1)
+    return BoundLearner(Config.model_validate(preset | {"apg_fraction": 0.5} | changes, strict=False), 2, 1)
 
 
 def policy_of(state: LearnerState) -> np.ndarray:
@@ -136,7 +137,7 @@ def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
     def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
         return analytic_gradient.returns(env, lambda o: ours.mean(now, o), jnp.float32(0.0), keys, 20)
 
-    climb = jax.jit(lambda now, i: ours.climb(now, flown, i))
+    climb = jax.jit(lambda now, i: ours.apg_update(now, flown, i))
     state = first = ours.init(jax.random.PRNGKey(1))
     for i in range(29):
         state, _, _ = climb(state, i)
@@ -145,7 +146,7 @@ def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
     assert sums[1] == ours.config.apg_num_envs
     assert state.updates == 30
     jax.tree.map(np.testing.assert_array_equal, state.params.critic, first.params.critic)
-    jax.tree.map(np.testing.assert_array_equal, state.optimiser.critic, first.optimiser.critic)
+    jax.tree.map(np.testing.assert_array_equal, state.optimizer.critic, first.optimizer.critic)
     jax.tree.map(np.testing.assert_array_equal, state.average, state.params.policy)
 
 
@@ -153,20 +154,20 @@ def test_the_first_climb_begins_with_what_ships_and_a_fresh_optimiser() -> None:
     """Adam's first step is the sign of the gradient, whatever it had seen before; the last one's size is near 0."""
     ours = learner(average_fraction=0.5, max_grad_norm=1e9)
     state = ours.init(jax.random.PRNGKey(1))
-    seen = jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimiser.policy)
+    seen = jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimizer.policy)
     average = jax.tree.map(lambda x: x + 1.0, state.params.policy)
     state = state._replace(
-        optimiser=state.optimiser._replace(policy=seen), average=average, updates=jnp.int32(ours.total_updates)
+        optimizer=state.optimizer._replace(policy=seen), average=average, updates=jnp.int32(ours.total_updates)
     )
 
     def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
         return sum(jnp.sum(3.0 * x) for x in jax.tree.leaves(now.params.policy))[None], jnp.ones(1)
 
-    after, terms, _ = ours.climb(state, flown, jnp.int32(0))
+    after, terms, _ = ours.apg_update(state, flown, jnp.int32(0))
     ships = policy_of(state._replace(params=state.params._replace(policy=average)))
     np.testing.assert_allclose(policy_of(after) - ships, ours.config.apg_learning_rate, rtol=1e-3)
     np.testing.assert_allclose(terms.policy_gradient, 3.0 * np.sqrt(len(ships)), rtol=1e-5)
-    last, _, _ = ours.climb(after, flown, jnp.int32(ours.config.num_apg_updates - 1))
+    last, _, _ = ours.apg_update(after, flown, jnp.int32(ours.config.num_apg_updates - 1))
     moved = np.abs(policy_of(last) - policy_of(after)).max()
     assert 0 < moved < 3.0 * ours.config.apg_learning_rate / ours.config.num_apg_updates
 
@@ -179,10 +180,10 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
         slopes = [jnp.sum(jnp.sqrt(x - x)) for x in jax.tree.leaves(now.params.policy)]  # infinite
         return jnp.stack(slopes), jnp.ones(1)
 
-    state = state._replace(optimiser=jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimiser))  # a momentum
-    after, terms, _ = ours.climb(state, flown, jnp.int32(1))
+    state = state._replace(optimizer=jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimizer))  # a momentum
+    after, terms, _ = ours.apg_update(state, flown, jnp.int32(1))
     np.testing.assert_array_equal(policy_of(after), policy_of(state))
-    jax.tree.map(np.testing.assert_array_equal, after.optimiser, state.optimiser)
+    jax.tree.map(np.testing.assert_array_equal, after.optimizer, state.optimizer)
     assert terms.policy_gradient == 0.0
 
 
@@ -273,10 +274,10 @@ class Nowhere(Pushed):
 def test_rewards_that_are_no_numbers_stop_the_climbs() -> None:
     """The fault is the run's, as it is while it learns."""
     config = run_config(**CLIMBING).learner
-    trainer, points = Trainer(Nowhere(), config), stack([point(Nowhere(), config)])
+    trainer, points = make_trainer(Nowhere(), config), stack([member_inputs(Nowhere(), config)])
     states = trainer.init(driver.seeds(0, 1), points)
     states = states._replace(unrolls=jnp.full(1, config.learning_unrolls, jnp.int32))
-    after = trainer.climb(states, points, np.int32(config.num_unrolls))
+    after = trainer.apg(states, points, np.int32(config.num_unrolls))
     assert (after.fault_update, after.fault_term) == (0, 0)
 
 
@@ -310,17 +311,17 @@ def test_stopped_among_the_climbs_it_goes_on_to_the_same_bits(tmp_path: Path, wh
 def test_members_do_not_mix(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Vmapped beside another, a seed's climbs are its own."""
     env, config = worlds.make("pendulum"), run_config(**CLIMBING).learner
-    trainer = Trainer(env, config)
+    trainer = make_trainer(env, config)
     learning, all_of_it = np.int32(config.learning_unrolls), np.int32(config.num_unrolls)
 
     def climbed(count: int) -> list[np.ndarray]:
-        points = stack([point(env, config)] * count)
-        states = trainer.advance(trainer.init(driver.seeds(0, count), points), points, learning)
-        return [np.asarray(x)[:1] for x in jax.tree.leaves(trainer.climb(states, points, all_of_it).learner.params)]
+        points = stack([member_inputs(env, config)] * count)
+        states = trainer.train(trainer.init(driver.seeds(0, count), points), points, learning)
+        return [np.asarray(x)[:1] for x in jax.tree.leaves(trainer.apg(states, points, all_of_it).learner.params)]
 
     one = climbed(1)
-    monkeypatch.setattr("qrl.training.trainer._in_turn", lambda members: members == 1)
-    trainer = Trainer(env, config)
+    monkeypatch.setattr("qrl.training.sharding.sequential_members", lambda count: count == 1)
+    trainer = make_trainer(env, config)
     for ours, theirs in zip(climbed(2), one, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4)
 

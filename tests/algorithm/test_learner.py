@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qrl.algorithm.learner import Hyper, Learner, LearnerState, Terms, hyper
+from bound_learner import BoundLearner
+from qrl.algorithm.learner import LearnerState, UpdateMetrics
 from qrl.algorithm.networks import log_density
 from qrl.algorithm.types import Transition
 from qrl.algorithm.vtrace import vtrace
@@ -58,7 +59,7 @@ def batch(seed: int = 0, ended: np.ndarray = ENDS["ends within"]) -> Transition:
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), values)
 
 
-def losses(learner: Learner, data: Transition) -> tuple[float, float]:
+def losses(learner: BoundLearner, data: Transition) -> tuple[float, float]:
     _, terms = jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)
     return float(terms.policy_loss), float(terms.value_loss)
 
@@ -71,7 +72,7 @@ def mlp(params: dict, x: np.ndarray) -> np.ndarray:
     return x
 
 
-def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tuple[float, float]:
+def literal_losses(learner: BoundLearner, data: Transition, off_policy: bool) -> tuple[float, float]:
     """Algorithm 1 and the paper's two losses for one minibatch, sample by sample in float64."""
     c, state = learner.config, learner.init(jax.random.PRNGKey(1))
     scale = np.asarray(c.observation_scale or (1.0,) * F)
@@ -112,7 +113,7 @@ def literal_losses(learner: Learner, data: Transition, off_policy: bool) -> tupl
 @pytest.mark.parametrize("ended", ENDS.values(), ids=ENDS)
 def test_losses_are_the_papers(changes: dict, ended: np.ndarray) -> None:
     """L_policy and L_value of Sec. 4 and Algorithm 1, against a literal loop, for each condition."""
-    learner, data = Learner(config(**changes), F, A), batch(ended=ended)
+    learner, data = BoundLearner(config(**changes), F, A), batch(ended=ended)
     expected = literal_losses(learner, data, off_policy=learner.config.advantage == "pi")
     np.testing.assert_allclose(losses(learner, data), expected, rtol=2e-4)
 
@@ -120,13 +121,13 @@ def test_losses_are_the_papers(changes: dict, ended: np.ndarray) -> None:
 @pytest.mark.parametrize("steps", [1, 2])
 def test_unrolls_may_be_short(steps: int) -> None:
     """Of one step there is none within; of two, one."""
-    learner, data = Learner(config(), F, A), batch(ended=ENDS["one end within"][:, :steps])
+    learner, data = BoundLearner(config(), F, A), batch(ended=ENDS["one end within"][:, :steps])
     np.testing.assert_allclose(losses(learner, data), literal_losses(learner, data, off_policy=True), rtol=2e-4)
 
 
 def test_members_side_by_side_have_their_own_ends() -> None:
     """Under vmap, as on a GPU, a member whose V is computed anew throughout changes no other."""
-    learner = Learner(config(), F, A)
+    learner = BoundLearner(config(), F, A)
     each = [batch(0, ENDS["ends within"]), batch(1, ENDS["one end within"])]
     state = learner.init(jax.random.PRNGKey(1))
     both = jax.tree.map(lambda *x: jnp.stack(x), *each)
@@ -137,7 +138,7 @@ def test_members_side_by_side_have_their_own_ends() -> None:
 
 def test_update_ascends_both_losses() -> None:
     """Repeated updates on one batch lower the value loss and raise the objective."""
-    learner = Learner(config(learning_rate=1e-2, num_timesteps=1_000_000), F, A)
+    learner = BoundLearner(config(learning_rate=1e-2, num_timesteps=1_000_000), F, A)
     data, update = batch(), jax.jit(learner.update)
     state, first = update(learner.init(jax.random.PRNGKey(1)), data)
     last = first
@@ -153,7 +154,7 @@ def test_normalised_the_policy_gradient_is_divided_by_the_deviation_of_a() -> No
     data = data._replace(reward=5.0 * data.reward)
     plain, normal = (
         jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)[1]
-        for learner in (Learner(config(normalize_advantage=on), F, A) for on in (False, True))
+        for learner in (BoundLearner(config(normalize_advantage=on), F, A) for on in (False, True))
     )
     assert plain.a_trace > 2.0
     np.testing.assert_allclose(normal.policy_gradient, plain.policy_gradient / plain.a_trace, rtol=1e-5)
@@ -165,9 +166,9 @@ def test_a_minibatch_in_parts_is_the_whole(xi: float | None) -> None:
     """A trajectory on each of three devices: A is normalised by its deviation over all."""
     data = batch()
     data = data._replace(reward=data.reward * jnp.array([0.2, 1.0, 5.0])[:, None])  # parts differ
-    learner = Learner(config(xi=xi), F, A)
+    learner = BoundLearner(config(xi=xi), F, A)
     whole = jax.jit(learner.update)(learner.init(jax.random.PRNGKey(1)), data)
-    shared = Learner(config(xi=xi), F, A, "device")
+    shared = BoundLearner(config(xi=xi), F, A, "device")
     parts = jax.tree.map(lambda x: x[:, None], data)
     each = jax.jit(jax.vmap(shared.update, in_axes=(None, 0), axis_name="device"))(
         learner.init(jax.random.PRNGKey(1)), parts
@@ -178,15 +179,15 @@ def test_a_minibatch_in_parts_is_the_whole(xi: float | None) -> None:
 
 def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
     """Targets and advantages are constants: scaling rewards by −1 leaves the critic's own pull, not a mixed one."""
-    learner = Learner(config(normalize_advantage=False), F, A)
+    learner = BoundLearner(config(normalize_advantage=False), F, A)
     state, data = learner.init(jax.random.PRNGKey(1)), batch()
-    gradient = jax.jit(jax.grad(lambda p: learner._loss(p, state, data)[0]))(state.params)
+    gradient = jax.jit(jax.grad(lambda p: learner.loss(p, state, data)[0]))(state.params)
 
     def critic_only(critic: object) -> jax.Array:
         target = jax.lax.stop_gradient
         params = state.params._replace(critic=critic)
         value = learner.critic.apply(critic, data.observation)[..., 0]
-        loss, terms = learner._loss(params, state, data)
+        loss, terms = learner.loss(params, state, data)
         del loss
         # value_loss = mean (V − V^trace)²: its gradient with a constant target is 2·mean (V − V^trace)·dV.
         _, v_trace = _traces(learner, state, data)
@@ -196,7 +197,7 @@ def test_gradient_reaches_each_network_only_from_its_own_loss() -> None:
     jax.tree.map(lambda g, e: np.testing.assert_allclose(g, e, atol=1e-5), gradient.critic, expected)
 
 
-def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[jax.Array, jax.Array]:
+def _traces(learner: BoundLearner, state: LearnerState, data: Transition) -> tuple[jax.Array, jax.Array]:
     c = learner.config
     value = learner.critic.apply(state.params.critic, data.observation)[..., 0]
     after = learner.critic.apply(state.params.critic, data.next_observation)[..., 0]
@@ -210,7 +211,7 @@ def _traces(learner: Learner, state: LearnerState, data: Transition) -> tuple[ja
 
 def test_sigma_is_log_linear_and_ends_where_it_should() -> None:
     """sigma at the start, sigma_end after the last update, the geometric mean half-way."""
-    learner = Learner(config(sigma=0.4, sigma_end=0.1), F, A)
+    learner = BoundLearner(config(sigma=0.4, sigma_end=0.1), F, A)
     state = learner.init(jax.random.PRNGKey(0))
     at = lambda share: float(learner.sigma(state._replace(updates=jnp.int32(round(share * learner.total_updates)))))  # noqa: E731
     np.testing.assert_allclose([at(0.0), at(0.5), at(1.0)], [0.4, 0.2, 0.1], rtol=1e-4)
@@ -218,7 +219,7 @@ def test_sigma_is_log_linear_and_ends_where_it_should() -> None:
 
 def test_average_is_the_mean_of_the_last_policies() -> None:
     """With averaging on, what ships is the arithmetic mean of the policies of the run's last part."""
-    learner = Learner(
+    learner = BoundLearner(
         config(num_timesteps=64 * 50 * 5, warmup_unrolls=1, updates_per_unroll=4, average_fraction=0.5), F, A
     )
     state, data, update = learner.init(jax.random.PRNGKey(1)), batch(), jax.jit(learner.update)
@@ -228,36 +229,36 @@ def test_average_is_the_mean_of_the_last_policies() -> None:
         policies.append(state.params.policy)
     last = policies[learner.total_updates // 2 :]
     expected = jax.tree.map(lambda *p: np.mean(p, axis=0), *last)
-    shipped = learner.shipped(state).params.policy
+    shipped = learner.deployed(state).params.policy
     jax.tree.map(lambda s, e: np.testing.assert_allclose(s, e, rtol=1e-5, atol=1e-6), shipped, expected)
 
 
 def test_observation_statistics_standardise() -> None:
     """With normalize_observations the networks see zero mean and unit deviation."""
-    learner = Learner(config(normalize_observations=True), F, A)
+    learner = BoundLearner(config(normalize_observations=True), F, A)
     data = 3.0 + 2.0 * jax.random.normal(jax.random.PRNGKey(2), (4000, F))
-    state = learner.observe(learner.init(jax.random.PRNGKey(0)), data)
-    seen = learner.scale(state, data)
+    state = learner.update_statistics(learner.init(jax.random.PRNGKey(0)), data)
+    seen = learner.preprocess(state, data)
     np.testing.assert_allclose(np.mean(seen, 0), 0.0, atol=1e-2)
     np.testing.assert_allclose(np.std(seen, 0), 1.0, atol=1e-2)
 
 
 @pytest.fixture(scope="module")
-def traced() -> tuple[Hyper, object]:
+def traced() -> tuple[Hyperparameters, object]:
     """Every hyperparameter that travels, and one compiled program of what they decide, half-way through a run."""
     here = config(observation_scale=[1.0] * F, num_timesteps=64 * 50 * 4, max_grad_norm=0.1, sigma=1.0, sigma_end=1.0)
-    learner, data = Learner(here, F, A), batch()
+    learner, data = BoundLearner(here, F, A), batch()
     state = learner.init(jax.random.PRNGKey(1))._replace(updates=jnp.int32(learner.total_updates // 2))
 
     @jax.jit
-    def decided(values: Hyper) -> tuple[LearnerState, Terms, jax.Array, LearnerState]:
-        other = learner.under(values)
-        climbed, *_ = other.climb(
+    def decided(values: Hyperparameters) -> tuple[LearnerState, UpdateMetrics, jax.Array, LearnerState]:
+        other = learner.with_hyper(values)
+        apg, *_ = other.apg_update(
             state, lambda now: (other.mean(now, data.observation).sum(axis=(1, 2)), jnp.ones(B)), jnp.int32(0)
         )
-        return *other.update(state, data), other.sigma(state), climbed
+        return *other.update(state, data), other.sigma(state), apg
 
-    return hyper(here), decided
+    return here.hyperparameters, decided
 
 
 @pytest.mark.parametrize("name", Hyperparameters._fields)
@@ -265,8 +266,11 @@ def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, na
     """One compiled program, another value: another result. (None that is declared traced is a constant in it.)"""
     values, decided = traced
     if name == "xi":  # whether it is there at all is static
-        values = values | {"xi": np.float32(0.01)}
-    first, second = decided(values), decided(values | {name: np.float32(0.5) * values[name] + np.float32(1e-4)})
+        values = values._replace(xi=np.float32(0.01))
+    first, second = (
+        decided(values),
+        decided(values._replace(**{name: np.float32(0.5) * getattr(values, name) + np.float32(1e-4)})),
+    )
     assert any(
         np.any(np.asarray(a) != np.asarray(b)) for a, b in zip(*map(jax.tree.leaves, (first, second)), strict=True)
     )
@@ -275,6 +279,6 @@ def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, na
 def test_other_values_make_the_learner_that_has_them(traced: tuple) -> None:
     """Under another configuration's values a learner does what one of that configuration does."""
     changes = {"gamma": 0.9, "epsilon": 0.05, "sigma": 0.5, "learning_rate": 1e-3, "reward_scaling": 0.3}
-    there, data = Learner(config(**changes), F, A), batch()
-    here = Learner(config(), F, A).under(hyper(there.config))
+    there, data = BoundLearner(config(**changes), F, A), batch()
+    here = BoundLearner(config(), F, A).with_hyper(there.config.hyperparameters)
     np.testing.assert_array_equal(losses(here, data), losses(there, data))

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from qrl.algorithm import replay_buffer
-from qrl.algorithm.replay_buffer import Ring
+from qrl.algorithm.replay_buffer import ReplayBuffer
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # flashbax's own imports
@@ -25,9 +25,9 @@ add = jax.jit(replay_buffer.add)
 
 
 @jax.jit
-def sample(ring: Ring, key: jax.Array) -> Any:
+def sample(ring: ReplayBuffer, key: jax.Array) -> Any:
     """BATCH trajectories, drawn as two minibatches at once."""
-    return replay_buffer.gather(ring, replay_buffer.draw(ring, key[None], 2, BATCH // 2).reshape(BATCH))
+    return replay_buffer.gather(ring, replay_buffer.sample(ring, key[None], 2, BATCH // 2).reshape(BATCH))
 
 
 def tag(unroll: Array | int, lane: Array | int) -> Array:
@@ -48,7 +48,7 @@ def unroll_number(i: int) -> dict[str, Array]:
 
 
 @pytest.fixture(scope="module")
-def ring_after() -> list[Ring]:
+def ring_after() -> list[ReplayBuffer]:
     """The ring before any unroll, after one, after two …"""
     filled = [replay_buffer.create(unroll_number(0), SLOTS)]
     for i in ADDS:
@@ -85,7 +85,7 @@ def kept(adds: int) -> Array:
     return np.sort(tag(unrolls[:, None], np.arange(LANES)).ravel())
 
 
-def in_time_order(ring: Ring) -> Any:
+def in_time_order(ring: ReplayBuffer) -> Any:
     """Our leaves [slots, N, T, ...] as flashbax lays them out: [N, slots·T, ...]."""
     return jax.tree.map(
         lambda x: np.moveaxis(np.asarray(x), 0, 1).reshape(LANES, SLOTS * STEPS, *x.shape[3:]), ring.data
@@ -93,7 +93,9 @@ def in_time_order(ring: Ring) -> Any:
 
 
 @pytest.mark.parametrize("adds", range(1, len(ADDS) + 1))
-def test_contents_are_flashbaxs_after_every_add(adds: int, ring_after: list[Ring], theirs_after: list[Any]) -> None:
+def test_contents_are_flashbaxs_after_every_add(
+    adds: int, ring_after: list[ReplayBuffer], theirs_after: list[Any]
+) -> None:
     """Partly filled, full, and wrapped around twice; what is empty is zero."""
     ours, expected = ring_after[adds], theirs_after[adds]
     for leaf, their_leaf in zip(
@@ -107,7 +109,7 @@ def test_contents_are_flashbaxs_after_every_add(adds: int, ring_after: list[Ring
 
 
 def test_sampled_trajectories_are_those_flashbax_samples(
-    ring_after: list[Ring], theirs: Any, theirs_after: list[Any]
+    ring_after: list[ReplayBuffer], theirs: Any, theirs_after: list[Any]
 ) -> None:
     """The same set of whole trajectories, at every fill."""
     their_sample = jax.jit(theirs.sample)
@@ -119,7 +121,7 @@ def test_sampled_trajectories_are_those_flashbax_samples(
 
 
 @pytest.mark.parametrize("adds", range(1, len(ADDS) + 1))
-def test_samples_are_whole_trajectories_of_filled_slots(adds: int, ring_after: list[Ring]) -> None:
+def test_samples_are_whole_trajectories_of_filled_slots(adds: int, ring_after: list[ReplayBuffer]) -> None:
     """Every leaf of a row is one trajectory from its first step to its last, and all that are kept turn up."""
     drawn = sample(ring_after[adds], jax.random.key(adds))
     trajectory, step = np.asarray(drawn["trajectory"][:, :1]), np.arange(STEPS)
@@ -132,7 +134,7 @@ def test_samples_are_whole_trajectories_of_filled_slots(adds: int, ring_after: l
 
 
 @pytest.mark.parametrize("adds", [1, SLOTS - 1, SLOTS, SLOTS + 1, 2 * SLOTS + 2])
-def test_samples_are_uniform_and_independent(adds: int, ring_after: list[Ring]) -> None:
+def test_samples_are_uniform_and_independent(adds: int, ring_after: list[ReplayBuffer]) -> None:
     """Chi-square over trajectories, and over pairs of neighbours in the minibatch (drawn with replacement)."""
     count = 0
     pairs = np.zeros((len(kept(adds)), len(kept(adds))))
@@ -150,7 +152,7 @@ def test_shards_draw_their_part_of_each_minibatch_from_their_own_lanes(adds: int
     """As a ring of those lanes alone would with the same key: so it does not matter which shards share a device."""
     shards, width, each, minibatches = 3, 2, 64, 4
 
-    def ring_of(lanes: Array) -> Ring:
+    def ring_of(lanes: Array) -> ReplayBuffer:
         ring = replay_buffer.create({"x": np.zeros((len(lanes), 1), np.int32)}, SLOTS)
         for i in range(adds):
             ring = add(ring, {"x": (100 * i + lanes)[:, None].astype(np.int32)})
@@ -158,7 +160,7 @@ def test_shards_draw_their_part_of_each_minibatch_from_their_own_lanes(adds: int
 
     def drawn(lanes: Array, keys: jax.Array) -> Array:
         ring = ring_of(lanes)
-        index = replay_buffer.draw(ring, keys, minibatches, each)
+        index = replay_buffer.sample(ring, keys, minibatches, each)
         assert index.shape == (minibatches, len(keys) * each)
         return np.asarray(replay_buffer.gather(ring, index)["x"])[..., 0]
 
@@ -172,7 +174,7 @@ def test_shards_draw_their_part_of_each_minibatch_from_their_own_lanes(adds: int
     assert (whole[:, 0] % width != whole[:, 1] % width).any()  # they do not draw alike
 
 
-def test_the_key_decides_the_sample(ring_after: list[Ring]) -> None:
+def test_the_key_decides_the_sample(ring_after: list[ReplayBuffer]) -> None:
     """The same key draws the same, another another."""
     first, again, other = (sample(ring_after[-1], jax.random.key(seed))["trajectory"] for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
@@ -194,8 +196,8 @@ def test_what_is_added_takes_the_rings_types() -> None:
 def test_members_side_by_side_share_the_cursor() -> None:
     """vmapped over members with `inserted` unbatched, as the module asks, each member has its own contents."""
     one = replay_buffer.create(unroll_number(0), 2)
-    members = Ring(jax.tree.map(lambda x: jnp.stack([x, x]), one.data), one.inserted)
-    axes = Ring(0, None)
+    members = ReplayBuffer(jax.tree.map(lambda x: jnp.stack([x, x]), one.data), one.inserted)
+    axes = ReplayBuffer(0, None)
     side_by_side = jax.jit(jax.vmap(replay_buffer.add, in_axes=(axes, 0), out_axes=axes))
     for i in range(3):
         both = jax.tree.map(lambda *x: np.stack(x), unroll_number(10 * i), unroll_number(10 * i + 1))

@@ -12,8 +12,11 @@ from brax.envs.base import Env, State
 from scipy import stats
 
 from qrl.algorithm import rollout
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.rollout import Lanes
 from qrl.algorithm.types import Transition
+from qrl.config import Config
+from qrl.training.trainer import Setup
 from qrl_envs import env as worlds
 from qrl_envs import task
 
@@ -92,7 +95,7 @@ class Flight(NamedTuple):
 
 @functools.cache
 def begin_of(env: Env) -> Callable[[jax.Array], Lanes]:
-    return jax.jit(lambda key: rollout.begin(env, key, jnp.arange(LANES), LANES, LONGEST, T))
+    return jax.jit(lambda key: rollout.init(adapt(env), key, jnp.arange(LANES), LANES, LONGEST, T))
 
 
 @functools.cache
@@ -100,7 +103,7 @@ def unroll_of(env: Env) -> Callable[..., tuple[Lanes, Transition]]:
     sigma = jnp.float32(SIGMA)
     return jax.jit(
         lambda lanes, key, starts: rollout.unroll(
-            env, lanes, mean, sigma, key, starts, unroll_length=T, longest=LONGEST
+            adapt(env), lanes, mean, sigma, key, starts, unroll_length=T, max_episode_steps=LONGEST
         )
     )
 
@@ -125,7 +128,7 @@ def begin(env: Fenced, seed: int, fence: float = 1.2) -> Lanes:
     x = np.array(lanes.state.obs)
     x[:, GAIN], x[:, FENCE] = GAINS, fence
     state = lanes.state.replace(pipeline_state=jnp.asarray(x), obs=jnp.asarray(x))
-    return lanes._replace(state=state, fresh=state)
+    return lanes._replace(state=state, next_state=state)
 
 
 @functools.cache
@@ -242,7 +245,7 @@ def test_episodes_are_cut_at_the_longest(unfenced: Flight) -> None:
 @pytest.mark.parametrize(("lanes", "longest", "unroll_length"), [(8, 40, 10), (7, 200, 50), (3, 100, 50), (5, 30, 50)])
 def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll_length: int) -> None:
     """Ages are multiples of an unroll, below the longest episode, spread over it as evenly as whole lanes can be."""
-    begun = jax.jit(lambda key: rollout.begin(PLAIN, key, jnp.arange(lanes), lanes, longest, unroll_length))(
+    begun = jax.jit(lambda key: rollout.init(adapt(PLAIN), key, jnp.arange(lanes), lanes, longest, unroll_length))(
         jax.random.key(0)
     )
     ages = np.asarray(begun.steps)
@@ -252,7 +255,7 @@ def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll
     _, counts = np.unique(ages, return_counts=True)
     assert len(counts) == min(lanes, -(-longest // unroll_length))
     assert counts.max() - counts.min() <= 1
-    assert not begun.ended.any()
+    assert not begun.done.any()
     assert len(np.unique(begun.state.obs, axis=0)) == lanes
 
 
@@ -263,8 +266,8 @@ def test_early_counts_the_episodes_cut_short(flight: Flight, unfenced: Flight) -
     age = flight.steps.next_observation[..., CLOCK] + first * np.asarray(flight.begun.steps)[:, None]
     cut_short = ends(flight.steps) & (age < LONGEST)
     assert late.sum() < cut_short.sum()
-    np.testing.assert_array_equal(flight.ended.early, cut_short.sum(axis=1))
-    assert not unfenced.ended.early.any()
+    np.testing.assert_array_equal(flight.ended.num_early, cut_short.sum(axis=1))
+    assert not unfenced.ended.num_early.any()
 
 
 def test_actions_are_recorded_as_drawn_and_flown_clipped(flight: Flight) -> None:
@@ -325,7 +328,9 @@ def test_a_lane_flies_as_it_would_without_its_neighbours() -> None:
         alone = fly(MARKED, jax.tree.map(lambda x, half=half: x[half], begun), seed=7).steps
         for ours, expected in zip(alone, whole, strict=True):
             np.testing.assert_allclose(ours, expected[half], rtol=1e-5, atol=1e-5)
-    first = jax.jit(lambda key: rollout.begin(MARKED, key, jnp.arange(3, 6), LANES, LONGEST, T))(jax.random.key(7))
+    first = jax.jit(lambda key: rollout.init(adapt(MARKED), key, jnp.arange(3, 6), LANES, LONGEST, T))(
+        jax.random.key(7)
+    )
     of_all = begin_of(MARKED)(jax.random.key(7))
     np.testing.assert_array_equal(first.state.obs, of_all.state.obs[3:])
     np.testing.assert_array_equal(first.steps, of_all.steps[3:])
@@ -334,14 +339,15 @@ def test_a_lane_flies_as_it_would_without_its_neighbours() -> None:
 def test_lanes_are_handed_on_before_the_reset(flight: Flight) -> None:
     """The state after an unroll is the one last observed, its end marked for the next unroll to see."""
     np.testing.assert_array_equal(flight.ended.state.obs, flight.steps.next_observation[:, -1])
-    np.testing.assert_array_equal(flight.ended.ended, ends(flight.steps)[:, -1])
+    np.testing.assert_array_equal(flight.ended.done, ends(flight.steps)[:, -1])
 
 
 def test_the_longest_episode_is_the_configured_else_the_tasks_else_1000() -> None:
     """Ours say their own."""
-    assert rollout.episode_steps(worlds.make("hover"), 77) == 77
-    assert rollout.episode_steps(worlds.make("hover"), None) == 200
-    assert rollout.episode_steps(PLAIN, None) == 1000
+    hover, default = worlds.make("hover"), Config.preset("hover")
+    assert Setup(adapt(hover), default).max_episode_steps == 200
+    assert Setup(adapt(hover), default.model_copy(update={"episode_length": 77})).max_episode_steps == 77
+    assert Setup(adapt(PLAIN), default).max_episode_steps == 1000
 
 
 @pytest.mark.parametrize("lanes", [8, 9], ids=["two blocks of 4", "three of 3"])
@@ -354,10 +360,12 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
 
     def run() -> tuple[Any, ...]:
         key = jax.random.PRNGKey(3)
-        begun = rollout.begin(env, key, jnp.arange(lanes), lanes, LONGEST, T)
+        begun = rollout.init(adapt(env), key, jnp.arange(lanes), lanes, LONGEST, T)
         mean, sigma = (lambda observation: jnp.zeros((*observation.shape[:-1], env.action_size))), jnp.float32(0.5)
-        after, steps = rollout.unroll(env, begun, mean, sigma, key, key, unroll_length=3 * T, longest=LONGEST)
-        return steps, after.state, after.steps, after.ended, after.start + after.used, after.early
+        after, steps = rollout.unroll(
+            adapt(env), begun, mean, sigma, key, key, unroll_length=3 * T, max_episode_steps=LONGEST
+        )
+        return steps, after.state, after.steps, after.done, after.reset_count + after.next_state_used, after.num_early
 
     at_once = jax.jit(run)()
     monkeypatch.setattr(rollout, "BLOCK_LANES", 4)
@@ -375,8 +383,10 @@ def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
 
     @jax.jit
     def run(key: jax.Array) -> tuple[Lanes, Transition]:
-        lanes = rollout.begin(env, key, jnp.arange(4), 4, 100, 50)
-        return lanes, rollout.unroll(env, lanes, still, sigma, key, key, unroll_length=50, longest=100)[1]
+        lanes = rollout.init(adapt(env), key, jnp.arange(4), 4, 100, 50)
+        return lanes, rollout.unroll(
+            adapt(env), lanes, still, sigma, key, key, unroll_length=50, max_episode_steps=100
+        )[1]
 
     lanes, steps = run(jax.random.key(0))
     step, fled = jax.jit(env.step), 0

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.training.acme import running_statistics
+from brax.training.acme import running_statistics as brax_statistics
 from hypothesis import given
 from hypothesis import strategies as st
 
-from qrl.algorithm.running_statistics import LEAST_STD, deviation, merged, none_yet
+from qrl.algorithm.running_statistics import MIN_STD, init, std, update
 
 F = 3
 
@@ -22,48 +22,55 @@ def batches(sizes: list[int], offset: float = 3.0) -> list[np.ndarray]:
 def test_batch_by_batch_is_all_at_once(sizes: list[int]) -> None:
     """However the observations are parted; Brax's, by sums of squares, agrees."""
     parts = batches(sizes)
-    ours, theirs = none_yet(F), running_statistics.init_state(jnp.zeros(F))
+    ours, theirs = init(F), brax_statistics.init_state(jnp.zeros(F))
     for part in parts:
-        ours, theirs = merged(ours, jnp.asarray(part)), running_statistics.update(theirs, jnp.asarray(part))
+        ours, theirs = (
+            update(ours, jnp.asarray(part)),
+            brax_statistics.update(theirs, jnp.asarray(part)),
+        )
     whole = np.concatenate(parts).astype(np.float64)
     assert ours.n == len(whole)
     np.testing.assert_allclose(ours.mean, whole.mean(axis=0), rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(ours.variance, whole.var(axis=0), rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(deviation(ours), np.maximum(theirs.std, LEAST_STD), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(std(ours), np.maximum(theirs.std, MIN_STD), rtol=1e-3, atol=1e-3)
 
 
 def test_far_from_zero_the_variance_keeps_its_digits() -> None:
     """1,000 ± 1, which squares of float32 would not tell from 0."""
     parts = [1000.0 + np.random.default_rng(i).normal(size=(50, F)).astype(np.float32) for i in range(20)]
-    ours = none_yet(F)
+    ours = init(F)
     for part in parts:
-        ours = merged(ours, jnp.asarray(part))
+        ours = update(ours, jnp.asarray(part))
     np.testing.assert_allclose(ours.variance, np.concatenate(parts).astype(np.float64).var(axis=0), rtol=1e-3)
 
 
 def test_a_first_batch_that_hardly_varies_is_known_exactly() -> None:
     """The variance of 1 before it must not round it away."""
     batch = 1e-4 * np.random.default_rng(0).normal(size=(50, F)).astype(np.float32)
-    np.testing.assert_allclose(deviation(merged(none_yet(F), jnp.asarray(batch))), batch.std(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(
+        std(update(init(F), jnp.asarray(batch))),
+        batch.std(axis=0),
+        rtol=1e-5,
+    )
 
 
 def test_before_the_first_nothing_is_scaled() -> None:
-    assert none_yet(F).n == 0
-    np.testing.assert_array_equal(none_yet(F).mean, np.zeros(F))
-    np.testing.assert_array_equal(deviation(none_yet(F)), np.ones(F))
+    assert init(F).n == 0
+    np.testing.assert_array_equal(init(F).mean, np.zeros(F))
+    np.testing.assert_array_equal(std(init(F)), np.ones(F))
 
 
 def test_a_feature_that_does_not_vary_is_divided_by_no_zero() -> None:
-    still = merged(none_yet(F), jnp.ones((10, F)))
-    np.testing.assert_array_equal(deviation(still), np.full(F, LEAST_STD, np.float32))
+    still = update(init(F), jnp.ones((10, F)))
+    np.testing.assert_array_equal(std(still), np.full(F, MIN_STD, np.float32))
 
 
 @pytest.mark.parametrize("parts", [1, 2, 5])
 def test_parts_of_a_batch_on_each_device(parts: int) -> None:
     """As the whole batch on one; each device is told the same."""
     whole = jnp.asarray(batches([30])[0])
-    before = merged(none_yet(F), whole + 1.0)
-    each = jax.vmap(lambda part: merged(before, part, "device"), axis_name="device")(whole.reshape(parts, -1, F))
-    for ours, one in zip(each, merged(before, whole), strict=True):
+    before = update(init(F), whole + 1.0)
+    each = jax.vmap(lambda part: update(before, part, "device"), axis_name="device")(whole.reshape(parts, -1, F))
+    for ours, one in zip(each, update(before, whole), strict=True):
         for device in ours:
             np.testing.assert_allclose(device, one, rtol=1e-6)

@@ -146,7 +146,7 @@ def test_measures_see_the_whole_flight(judged: Flights) -> None:
 def test_an_environment_without_measures_has_its_return_alone(plain: Flights) -> None:
     """Foreign environments report their return only."""
     assert plain.measures == {}
-    summary = evaluate.summarise(plain)
+    summary = evaluate.summarize(plain)
     assert summary.keys() == {"return_mean", "return_min", "success"}
     assert np.isnan(summary["success"])
 
@@ -190,7 +190,7 @@ def test_summary_is_numpys(n: int) -> None:
     rng = np.random.default_rng(n)
     settle, error, success = rng.uniform(size=n), rng.uniform(size=n), rng.integers(0, 2, size=n).astype(float)
     flights = flown(n, success=success, settle_s=settle, rms_position_m=error)
-    assert evaluate.summarise(flights) == pytest.approx(
+    assert evaluate.summarize(flights) == pytest.approx(
         {
             "return_mean": np.mean(flights.returns),
             "return_min": np.min(flights.returns),
@@ -209,7 +209,7 @@ def test_flights_that_never_settle_count_as_infinite(never: int, median: float, 
     """Of 100: settle times are finite where enough of them are, and never a NaN."""
     settle = np.where(np.arange(100) < never, np.inf, 1.0)
     flights = flown(100, success=np.isfinite(settle), settle_s=settle, rms_position_m=settle)
-    summary = evaluate.summarise(flights)
+    summary = evaluate.summarize(flights)
     assert (summary["settle_median_s"], summary["settle_p95_s"]) == (median, p95)
     assert summary["success"] == pytest.approx(1 - never / 100)
     assert summary["rms_position_m"] == median

@@ -24,7 +24,7 @@ from qrl.config import Config
 from qrl.runs import files, learning_curve, record
 from qrl.runs.record import RunConfig, TaskRecord
 from qrl.sweep import grid, runner
-from qrl.training.state import point
+from qrl.training.state import member_inputs
 from qrl_envs import io_spec, specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput
@@ -62,7 +62,7 @@ RESULTS = {0: runner.Result(ROWS, ""), 1: runner.Result(ROWS, "reward is not fin
 def starts(task: TaskRecord, learner: Config, where: Path) -> None:
     env = tasks.environment(task)
     tasks.check(env, learner, str(where))
-    point(env, learner)
+    member_inputs(env, learner)
 
 
 def reads_task(path: Path) -> None:

@@ -1,6 +1,5 @@
 """Symmetries of the tasks: the turned world goes the turned way, for the same reward."""
 
-import json
 from typing import Any
 
 import jax
@@ -9,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from qrl.algorithm import augmentation
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.types import Transition
-from qrl.config import Config, load_preset
-from qrl.training.trainer import Trainer
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from qrl_envs import task as tasks
@@ -134,16 +133,24 @@ def test_the_pendulum_swings_either_way() -> None:
     assert found == {1.0, -1.0}
 
 
+class Plain:
+    """An environment without symmetries."""
+
+    observation_size, action_size = 18, 4
+
+    def reset(self, rng: jax.Array) -> Any: ...
+    def step(self, state: Any, action: jax.Array) -> Any: ...
+
+
 def test_a_minibatch_is_turned_trajectory_by_trajectory() -> None:
     """Observations and actions by the symmetry that each trajectory's numbers draw; all else is left."""
     env, rng = worlds.make("hover"), np.random.default_rng(0)
-    learner = Config.model_validate_json(json.dumps(load_preset("hover") | {"num_envs": 8, "batch_size": 3}))
     shape, turns = (3, 5), jnp.asarray(rng.random((3, 2)), jnp.float32)
     scalars = [jnp.asarray(rng.normal(size=shape), jnp.float32) for _ in range(5)]
     observation, after = jnp.asarray(rng.normal(size=(2, *shape, 18)), jnp.float32)
     action = jnp.asarray(rng.normal(size=(*shape, 4)), jnp.float32)
     batch = Transition(observation, action, *scalars[:2], after, *scalars[2:])
-    turned = Trainer(env, learner)._turned(env, batch, turns)
+    turned = augmentation.augment(env, batch, turns)
     for i in range(3):
         turn = env.symmetry(turns[i])
         for t in range(5):
@@ -152,5 +159,5 @@ def test_a_minibatch_is_turned_trajectory_by_trajectory() -> None:
             np.testing.assert_allclose(turned.action[i, t], turn.action @ action[i, t], rtol=1e-5)
     rest = {"observation": 0, "next_observation": 0, "action": 0}
     jax.tree.map(np.testing.assert_array_equal, turned._replace(**rest), batch._replace(**rest))
-    off = learner.model_copy(update={"symmetries": False})
-    jax.tree.map(np.testing.assert_array_equal, Trainer(env, off)._turned(env, batch, turns), batch)
+    plain = adapt(Plain())
+    jax.tree.map(np.testing.assert_array_equal, augmentation.augment(plain, batch, turns), batch)

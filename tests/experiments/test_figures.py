@@ -27,8 +27,8 @@ from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED
 from qrl.runs import files, record
 from qrl.training import restore
 from qrl.training.driver import seeds
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import Trainer, make_trainer
 from qrl_envs import env as worlds
 from qrl_envs import task
 
@@ -289,8 +289,8 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     folder, config = folder_of(tmp_path / "run", small), small.config()
 
     def untrained(env: Any, *_: object) -> tuple[Trainer, Any, int]:
-        trainer = Trainer(env, config.learner)
-        return trainer, trainer.init(seeds(0, 1), stack([point(env, config.learner)])).learner, 7
+        trainer = make_trainer(env, config.learner)
+        return trainer, trainer.init(seeds(0, 1), stack([member_inputs(env, config.learner)])).learner, 7
 
     monkeypatch.setattr(restore, "last", untrained)
     trial, nominal = (figure_flights.flown(folder, trial=trial, starts=2) for trial in (True, False))

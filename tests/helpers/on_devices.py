@@ -12,9 +12,9 @@ import numpy as np
 
 from qrl.config import Config, load_preset
 from qrl.training import driver
-from qrl.training.sharding import spread
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.sharding import device_put, make_mesh
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 
 LITTLE = {
@@ -46,21 +46,21 @@ def main(folder: Path) -> None:
     config = Config.model_validate(load_preset("pendulum") | LITTLE, strict=False)
     saved = None
     for seeds, count in ((1, 1), (1, 2), (1, 8), (2, 8)):
-        points = stack([point(env, config)] * seeds)
-        trainer = Trainer(env, config, spread(jax.devices()[:count], seeds, config.shard_count))
-        states = trainer.advance(trainer.init(driver.seeds(5, seeds), points), points, np.int32(TEN_UPDATES))
+        points = stack([member_inputs(env, config)] * seeds)
+        trainer = make_trainer(env, config, make_mesh(jax.devices()[:count], seeds, config.shard_count))
+        states = trainer.train(trainer.init(driver.seeds(5, seeds), points), points, np.int32(TEN_UPDATES))
         flights = trainer.fly(states.learner, points, driver.report_starts(config))
-        np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.on_host((states, flights))))
+        np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.gather((states, flights))))
         if seeds == 1:
             saved = saved or trainer.member(states, 0)  # from one device, as a checkpoint has it
-            further = trainer.advance(trainer.place(stack([saved])), points, np.int32(TEN_UPDATES + 1))
-            np.savez(folder / f"further-{count}.npz", **named(trainer.on_host(further)))
+            further = trainer.train(device_put(trainer.setup.mesh, stack([saved])), points, np.int32(TEN_UPDATES + 1))
+            np.savez(folder / f"further-{count}.npz", **named(trainer.gather(further)))
             if count == 2:
                 continue
-            learnt = trainer.place(stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))
+            learnt = device_put(trainer.setup.mesh, stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))
             until = config.learning_unrolls + CLIMBS * config.unrolls_per_apg_update
-            climbed = trainer.climb(learnt, points, np.int32(until))
-            np.savez(folder / f"climbed-{count}.npz", **named(trainer.on_host(climbed)))
+            climbed = trainer.apg(learnt, points, np.int32(until))
+            np.savez(folder / f"climbed-{count}.npz", **named(trainer.gather(climbed)))
 
 
 if __name__ == "__main__":

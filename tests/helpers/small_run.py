@@ -43,7 +43,7 @@ def train(
 
     def stopped() -> bool:
         return (
-            stop_after is not None and sum(not isinstance(e, loop.Compiling | loop.GoingOn) for e in seen) >= stop_after
+            stop_after is not None and sum(not isinstance(e, loop.Compiling | loop.Resumed) for e in seen) >= stop_after
         )
 
     for event in loop.train(env, run, out, resume=resume, stopped=stopped):

@@ -22,8 +22,8 @@ from qrl.runs import checkpoint, files
 from qrl.runs.checkpoint import Checkpoint
 from qrl.runs.integrity import FORMAT, NAME, Damaged, Foreign, Record
 from qrl.training import driver, restore
-from qrl.training.state import TrainState, point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.state import TrainState, member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from small_run import run_config, train
 
@@ -45,7 +45,7 @@ def pendulum() -> Env:
 def like(pendulum: Env) -> TrainState:
     """Shapes and types of the state of a run of one seed."""
     learner = run_config().learner
-    return restore.shapes(Trainer(pendulum, learner), stack([point(pendulum, learner)]))
+    return restore.abstract_states(make_trainer(pendulum, learner), stack([member_inputs(pendulum, learner)]))
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,7 @@ _READ: dict[tuple[Path, int], Checkpoint] = {}
 
 def assert_restores(run: Path, env_steps: int, like: TrainState, small: Path) -> list[str]:
     """`latest` gives this checkpoint, equal to what the whole run holds; its notes."""
-    found = restore.latest([run], [run_config()], like)
+    found = restore.restore_common([run], [run_config()], like)
     assert found.env_steps == env_steps
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), like)
     wanted = (
@@ -154,7 +154,7 @@ def test_all_damaged_starts_afresh(tmp_path: Path, small: Path, like: TrainState
     for i, env_steps in enumerate(checkpoint.steps(run)):
         DAMAGE[i % 3](run / "checkpoints" / str(env_steps) / NAME)
         FAULTS.append(f"all damaged: {env_steps}")
-    found = restore.latest([run], [run_config()], like)
+    found = restore.restore_common([run], [run_config()], like)
     assert (found.env_steps, found.states, found.records) == (0, None, [])
     assert len(found.notes) == len(checkpoint.steps(small))
     assert all("starting afresh" in note for note in found.notes)
@@ -170,7 +170,7 @@ def test_newest_step_that_is_whole_for_all_seeds_is_used(tmp_path: Path, small: 
     flip(second / "checkpoints" / str(other) / NAME)
     FAULTS.extend(["no seal of one seed", "damage of the other"])
     pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape[1:]), x.dtype), like)
-    found = restore.latest([first, second], [run_config()] * 2, pair)
+    found = restore.restore_common([first, second], [run_config()] * 2, pair)
     assert found.env_steps == both
     assert len(found.notes) == 1
     assert str(second) in found.notes[0]
@@ -198,7 +198,7 @@ def test_checkpoint_of_another_run_is_not_taken(small: Path, like: TrainState) -
     for other in (run_config(seed=1), run_config(gamma=0.5)):
         FAULTS.append("another run's checkpoint")
         with pytest.raises(Foreign, match=r"of another run than config\.json"):
-            restore.latest([small], [other], like)
+            restore.restore_common([small], [other], like)
     assert fault_injection.digest(small) == before
 
 

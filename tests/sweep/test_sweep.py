@@ -22,10 +22,9 @@ from qrl.runs import files
 from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import load
 from qrl.sweep.runner import Group, Member, Result
-from qrl.training import driver, multihost
-from qrl.training import trainer as train
-from qrl.training.state import TrainState, point, stack
-from qrl.training.trainer import Trainer
+from qrl.training import driver, multihost, sharding
+from qrl.training.state import TrainState, member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 
@@ -210,7 +209,7 @@ def test_a_chunk_is_recorded_whole_or_not_at_all(tmp_path: Path, laps: int, reco
     """Stopped before its end, even after its first report (lap 5 of 10), it leaves nothing."""
     grid = load(write_grid(tmp_path, {"gamma": [0.9]}), 1e9)
     env, config = worlds.make("pendulum"), grid.points[0].learner
-    group = Group(Trainer(env, config), [Member(i, i, point(env, config)) for i in range(2)])
+    group = Group(make_trainer(env, config), [Member(i, i, member_inputs(env, config)) for i in range(2)])
     device = jax.devices()[0]
     programs = runner._compiled(group.trainer, group.members, 2, device)
     asked, chunks = iter(range(100)), tmp_path / "chunks"
@@ -303,7 +302,7 @@ def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: p
 
     grid = load(write_grid(tmp_path, {"gamma": [0.9]}), 1e9)
     env, config = worlds.make("pendulum"), grid.points[0].learner
-    group = Group(Trainer(env, config), [Member(0, 0, point(env, config))])
+    group = Group(make_trainer(env, config), [Member(0, 0, member_inputs(env, config))])
     monkeypatch.setattr(runner, "_compiled", lambda *_: None)
     monkeypatch.setattr(runner, "_chunk", chunk)
     with pytest.raises(IndexError, match="of our own"):
@@ -341,10 +340,10 @@ def test_the_estimate_of_a_chunk_covers_what_xla_needs(tmp_path: Path, members: 
         write_grid(tmp_path, {"gamma": [0.9]}, fixed={**TINY, "replay_unrolls": 50, "num_timesteps": 4000}), 1e9
     )
     env, config = worlds.make("pendulum"), grid.points[0].learner
-    trainer, here = Trainer(env, config), point(env, config)
+    trainer, here = make_trainer(env, config), member_inputs(env, config)
     points = stack([here] * members)
     states = jax.eval_shape(trainer.init, driver.seeds(0, members), points)
-    used: Any = driver.compile_advance(trainer, states, points).memory_analysis()
+    used: Any = driver.compile_train(trainer, states, points).memory_analysis()
     need = used.argument_size_in_bytes + used.output_size_in_bytes + used.temp_size_in_bytes - used.alias_size_in_bytes
     estimate = (members + 1) * runner.member_bytes(trainer, here)
     assert estimate / 4 <= need <= estimate
@@ -357,12 +356,12 @@ def test_vmapped_members_agree_with_members_in_turn(tmp_path: Path, monkeypatch:
     """After 9 updates, to 1e-4 of each number: the sums are taken in another order, and training amplifies that."""
     grid = load(write_grid(tmp_path, {"gamma": [0.9, 0.99], "task.rod.mass_kg": [1.0, 1.5]}), 1e9)
     config = grid.points[0].learner
-    points = stack([point(worlds.from_task(_task(p)), p.learner) for p in grid.points])
+    points = stack([member_inputs(worlds.from_task(_task(p)), p.learner) for p in grid.points])
 
     def last(in_turn: bool) -> TrainState:
-        monkeypatch.setattr(train, "_in_turn", lambda _: in_turn)
-        trainer = Trainer(worlds.make("pendulum"), config)
-        return trainer.advance(trainer.init(driver.seeds(0, 4), points), points, np.int32(config.num_unrolls))
+        monkeypatch.setattr(sharding, "sequential_members", lambda _: in_turn)
+        trainer = make_trainer(worlds.make("pendulum"), config)
+        return trainer.train(trainer.init(driver.seeds(0, 4), points), points, np.int32(config.num_unrolls))
 
     in_turn, at_once = last(in_turn=True), last(in_turn=False)
     assert int(in_turn.learner.updates[0]) == 9

@@ -67,7 +67,7 @@ ONE_THREAD = {"PJRT_NPROC": "1"}
 def test_what_is_said_stays(said: dict, added: dict) -> None:
     """A device may have one thread, whoever wants it to be one."""
     environment = dict(said)
-    processes.use_cores(run(**LITTLE), [], environment)
+    processes.configure_cpu(run(**LITTLE), [], environment)
     assert environment == said | added
 
 
@@ -80,7 +80,7 @@ def test_one_thread_for_little_work(changes: dict, environment: dict, monkeypatc
     """Where it cannot be parted, and nothing is said of what would gain by more."""
     monkeypatch.setattr(processes, "_cores", lambda: 2)
     said: dict[str, str] = {}
-    processes.use_cores(run(**changes), [], said)
+    processes.configure_cpu(run(**changes), [], said)
     assert said == environment
 
 
@@ -91,7 +91,7 @@ from qrl import request
 from qrl.training import devices as processes
 from qrl.runs.record import ConfigFile
 changes, before = json.loads(sys.argv[1])
-processes.use_cores(request.run_config("hover", None, ConfigFile(learner=changes), {}, 0, 1), before)
+processes.configure_cpu(request.run_config("hover", None, ConfigFile(learner=changes), {}, 0, 1), before)
 import jax
 jax.block_until_ready(jax.jit(lambda x: x @ x)(jax.numpy.ones((512, 512))))
 threads = sum("Eigen" in name.read_text() for name in Path("/proc/self/task").glob("*/comm"))

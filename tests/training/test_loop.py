@@ -10,9 +10,9 @@ from brax.envs.base import Env, State
 
 from fault_injection import assert_same_leaves, leaves
 from qrl.runs import checkpoint, files
-from qrl.training import driver, loop, restore
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training import driver, loop, restore, sharding
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from small_run import comparable_metrics, run_config, train
 
@@ -56,10 +56,10 @@ def test_resumed_run_equals_one_never_stopped(tmp_path: Path, pendulum: Env, who
 def test_a_restored_state_runs_the_program_of_a_first_one(task: str) -> None:
     """The same to the last letter: so a resumed run finds it compiled, and cannot differ by what XLA makes of it."""
     env, config = worlds.make(task), run_config().learner
-    trainer, points = Trainer(env, config), stack([point(env, config)])
-    first = restore.shapes(trainer, points)
-    restored = trainer.place(jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), first))
-    programs = [trainer.advance.lower(states, points, np.int32(0)).as_text() for states in (first, restored)]
+    trainer, points = make_trainer(env, config), stack([member_inputs(env, config)])
+    first = restore.abstract_states(trainer, points)
+    restored = sharding.device_put(None, jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), first))
+    programs = [trainer.train.lower(states, points, np.int32(0)).as_text() for states in (first, restored)]
     assert programs[0] == programs[1]
 
 
@@ -141,7 +141,7 @@ def test_row_without_its_checkpoint_is_cut_and_made_again(tmp_path: Path, pendul
 
 def test_no_checkpoint_is_said(tmp_path: Path, pendulum: Env) -> None:
     with pytest.raises(FileNotFoundError, match="no checkpoint"):
-        restore.last(pendulum, run_config(), tmp_path)
+        next(restore.iter_learners(make_trainer(pendulum, run_config().learner).setup.spec, run_config(), tmp_path, 1))
 
 
 def test_stop_before_the_first_step_saves_nothing(tmp_path: Path, pendulum: Env) -> None:

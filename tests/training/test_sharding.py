@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from qrl.config import Config, load_preset
-from qrl.training.sharding import spread
+from qrl.training.sharding import make_mesh
 
 TOLERANCE = 1e-5  # of everything after ten updates, absolute and relative
 FLIGHT_TOLERANCE = 1e-2  # of flights, in which a difference grows for 200 steps
@@ -88,7 +88,7 @@ def test_flights_of_the_analytic_gradient_are_shared(trained: dict[str, Values])
 )
 def test_devices_are_shared_evenly(devices: int, members: int, shards: int, shape: tuple[int, int] | None) -> None:
     """As many as members, and then shards, can be dealt out to in equal parts."""
-    mesh = spread(jax.devices() * devices, members, shards)
+    mesh = make_mesh(jax.devices() * devices, members, shards)
     assert (tuple(mesh.shape.values()) if mesh else None) == shape
 
 

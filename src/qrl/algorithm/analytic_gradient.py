@@ -1,7 +1,7 @@
-"""Analytic policy gradient: the return of whole flights, to be differentiated through the environment's own step.
+"""Analytic policy gradient (APG): ascend the return of flights, differentiated through the environment's own step.
 
-Backpropagation through time, as in Brax's APG (Freeman et al. 2021). For environments whose step and reward are
-differentiable, such as ours; no trajectory is needed but that of the policy itself, and no value function.
+Backpropagation through time, as in Brax's APG (Freeman et al. 2021), for environments whose step and reward are
+differentiable. It needs no stored trajectories and no value function.
 """
 
 from collections.abc import Callable
@@ -10,22 +10,19 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from qrl.algorithm import learner
+from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
 from qrl.algorithm.types import Env, State
+from qrl.config import Hyperparameters
 
 Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [..., A]
 
 
-def returns(
-    env: Env,
-    mean: Mean,
-    sigma: chex.Array,
-    keys: chex.PRNGKey,
-    steps: int,
-) -> tuple[chex.Array, chex.Array]:
-    """For each of `keys` [n] a flight of `steps` from a fresh start: the sum of its rewards, and whether it is whole.
+def returns(env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: int) -> tuple[chex.Array, chex.Array]:
+    """For each of `keys` [n] a flight of `steps` from a fresh start: sum of its rewards, and whether it is complete.
 
-    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not whole; its sum is 0,
-    without a gradient: where rewards are below 0, it would pay to end.
+    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not complete; its sum is 0,
+    without a gradient: where rewards are below 0, ending would pay.
     """
 
     def one(key: chex.PRNGKey) -> tuple[State, chex.Array]:
@@ -33,12 +30,59 @@ def returns(
         return env.reset(start), jax.random.normal(noise, (steps, env.action_size))
 
     def step(carry: tuple[State, chex.Array], noise: chex.Array) -> tuple[tuple[State, chex.Array], chex.Array]:
-        state, whole = carry
+        state, alive = carry
         after = jax.vmap(env.step)(state, jnp.clip(mean(state.obs) + sigma * noise, -1.0, 1.0))
-        return (after, whole * (1.0 - after.done)), after.reward
+        return (after, alive * (1.0 - after.done)), after.reward
 
     states, noise = jax.vmap(one)(keys)
-    # Each step once more on the way back: its intermediate values, of all steps, would not stay in a CPU's cache.
+    # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.
     first = states, jnp.ones_like(states.reward)
-    (_, whole), rewards = jax.lax.scan(jax.checkpoint(step), first, jnp.swapaxes(noise, 0, 1))
-    return jnp.where(whole > 0, jnp.sum(rewards, axis=0), 0.0), whole > 0
+    (_, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, jnp.swapaxes(noise, 0, 1))
+    return jnp.where(alive > 0, jnp.sum(rewards, axis=0), 0.0), alive > 0
+
+
+def decay(spec: LearnerSpec, step: chex.Array) -> chex.Array:
+    """Factor on step size and noise of APG update `step`, from 1 to 0.
+
+    (1 − progress)^1.5: with a linear decay policies still wandered by 2 mm near the end (docs/profile.md).
+    """
+    return (1.0 - step / max(1, spec.config.num_apg_updates)) ** 1.5
+
+
+def update(
+    spec: LearnerSpec,
+    hyper: Hyperparameters,
+    state: LearnerState,
+    returns_of: Callable[[LearnerState], tuple[chex.Array, chex.Array]],
+    step: chex.Array,
+) -> tuple[LearnerState, UpdateMetrics, chex.Array]:
+    """One step up the mean return; also the sums of returns and of complete flights, over all devices [2].
+
+    `returns_of` gives returns [n], differentiable in the policy, and whether each flight is complete [n]. `step`: int32
+    [], the number of this update. The first starts from the deployed policy with a new optimizer. Flights can be
+    chaotic: where the gradient is not finite, policy and optimizer stay.
+    """
+    before = learner.deployed(spec, state).params.policy
+    optimizer = jax.tree.map(lambda x: jnp.where(step == 0, 0, x).astype(x.dtype), state.optimizer.policy)
+
+    def loss(policy: chex.ArrayTree) -> tuple[chex.Array, chex.Array]:
+        values, complete = returns_of(state._replace(params=state.params._replace(policy=policy)))
+        return -jnp.mean(values), jnp.stack([jnp.mean(values), jnp.mean(complete)])
+
+    gradient, means = learner.mean_over_devices(spec, jax.grad(loss, has_aux=True)(before))
+    rate = decay(spec, step) * hyper.apg_learning_rate
+    after, optimizer_after, norm = learner.apply_gradient(hyper, before, gradient, optimizer, rate)
+    finite = jnp.isfinite(norm)
+    policy, optimizer = jax.tree.map(
+        lambda new, old: jnp.where(finite, new, old), (after, optimizer_after), (before, optimizer)
+    )
+    state = state._replace(
+        params=state.params._replace(policy=policy),
+        optimizer=state.optimizer._replace(policy=optimizer),
+        average=policy,
+        updates=state.updates + 1,
+    )
+    zero = jnp.zeros(())
+    metrics = UpdateMetrics(*[zero] * len(UpdateMetrics._fields))
+    metrics = metrics._replace(policy_loss=-means[0], policy_gradient=jnp.where(finite, norm, 0.0))
+    return state, metrics, spec.config.apg_num_envs * means

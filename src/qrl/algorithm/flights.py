@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.types import Env, State
 
 
@@ -24,18 +25,18 @@ def fly(
     env: Env,
     mean: Callable[[chex.Array], chex.Array],
     keys: chex.PRNGKey,
-    longest: int,
-    begin: Callable[[Env, chex.PRNGKey], State] = lambda env, keys: jax.vmap(env.reset)(keys),
+    max_episode_steps: int,
+    reset: Callable[[Env, chex.PRNGKey], State] = lambda env, keys: jax.vmap(env.reset)(keys),
 ) -> Flights:
     """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
 
-    `env` is the training environment; one with an `evaluation` (ours) is flown and measured as that says,
-    another for one episode of `longest` steps. `begin` draws the starts. Where sensors err, `info["sensed"]` is what
-    the policy sees; what is measured is the true observation. A flight that ends early has nothing more to observe:
-    its NaNs make it a failure wherever it ended.
+    An environment with an `evaluation` is flown and measured as that says, another for one episode of
+    `max_episode_steps`. `reset` draws the starts. Where sensors err, the policy sees `info["sensed"]`; measured is the
+    true observation. A flight that ends early has no more observations: its NaNs make it a failure.
     """
-    plan = getattr(env, "evaluation", lambda: None)()
-    env, steps, return_steps, measure = plan or (env, longest, longest, None)
+    plan = adapt(env).evaluation()
+    measure = plan.measure if plan else None
+    env, steps, return_steps = (plan.env, plan.steps, plan.return_steps) if plan else (env, *[max_episode_steps] * 2)
 
     def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
         state, total = carry
@@ -44,23 +45,23 @@ def fly(
         over = state.done.astype(bool)
         total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
-        return (held, total), (_seen(state), action)
+        return (held, total), (_observed(state), action)
 
-    state = begin(env, keys)
+    state = reset(env, keys)
     (state, returns), (observations, actions) = jax.lax.scan(step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps))
-    observations = jnp.concatenate([observations, _seen(state)[None]]).swapaxes(0, 1)
+    observations = jnp.concatenate([observations, _observed(state)[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
     return Flights(returns, measures, observations, actions.swapaxes(0, 1))
 
 
-def _seen(state: State) -> chex.Array:
+def _observed(state: State) -> chex.Array:
     return jnp.where(state.done.astype(bool)[:, None], jnp.nan, state.obs)
 
 
-def summarise(flights: Flights) -> dict[str, float]:
-    """What a report says of flights from n starts: mean and least return and, where measured, success (a
-    fraction), settle time (median and p95 over starts, infinite where too few settle) and each steady-state
-    error (the median over starts of each start's RMS).
+def summarize(flights: Flights) -> dict[str, float]:
+    """Summary of flights from n starts: mean and minimum return and, where measured, success (a fraction), settle time
+    (lower median and p95 over starts, infinite where too few settle) and each steady-state error (the median over
+    starts of each start's RMS).
     """
     returns = np.asarray(flights.returns)
     summary = {"return_mean": float(returns.mean()), "return_min": float(returns.min()), "success": float("nan")}

@@ -24,7 +24,7 @@ class MLP(nn.Module):
         for width in self.hidden:
             x = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5))(x))
         last = nn.Dense(
-            self.outputs, kernel_init=nn.initializers.orthogonal(self.final_gain), dot_general=_as_dense_calls_it
+            self.outputs, kernel_init=nn.initializers.orthogonal(self.final_gain), dot_general=_narrow_dot_general
         )
         return last(x)
 
@@ -39,18 +39,18 @@ def _forward(x: chex.Array, kernel: chex.Array) -> tuple[chex.Array, tuple[chex.
     return _product(x, kernel), (x, kernel)
 
 
-def _backward(seen: tuple[chex.Array, chex.Array], error: chex.Array) -> tuple[chex.Array, chex.Array]:
-    x, kernel = seen
-    # The barrier keeps XLA from folding the transposition into the product: as [F, outputs] a CPU takes six times as
-    # long over it where outputs are few.
-    turned = jax.lax.optimization_barrier(error.reshape(-1, error.shape[-1]).T @ x.reshape(-1, x.shape[-1]))
-    return error @ kernel.T, turned.T
+def _backward(residuals: tuple[chex.Array, chex.Array], error: chex.Array) -> tuple[chex.Array, chex.Array]:
+    x, kernel = residuals
+    # The barrier keeps XLA from folding the transposition into the product, which takes a CPU six times as long where
+    # outputs are few.
+    transposed = jax.lax.optimization_barrier(error.reshape(-1, error.shape[-1]).T @ x.reshape(-1, x.shape[-1]))
+    return error @ kernel.T, transposed.T
 
 
 _product.defvjp(_forward, _backward)
 
 
-def _as_dense_calls_it(
+def _narrow_dot_general(
     x: chex.Array, kernel: chex.Array, dimension_numbers: Any, precision: Any = None, **_: Any
 ) -> chex.Array:
     assert precision is None
@@ -62,3 +62,8 @@ def log_density(action: chex.Array, mean: chex.Array, sigma: float | chex.Array)
     """log N(action; mean, sigma²·I) summed over action dimensions; [..., A], [..., A], [] -> [...]."""
     z = (action - mean) / sigma
     return jnp.sum(-0.5 * z**2 - jnp.log(sigma) - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
+
+
+def apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:
+    """The network's output; [..., F] -> [..., outputs]."""
+    return jnp.asarray(network.apply(params, x))  # flax types its result as a union

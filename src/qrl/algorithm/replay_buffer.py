@@ -1,7 +1,7 @@
-"""Device-resident ring buffer of whole unrolls.
+"""Device-resident ring buffer of unrolls.
 
-A slot holds one unroll of all lanes; a full ring overwrites its oldest slot. `inserted` must stay unbatched
-where members are vmapped: a batched cursor turns the slice update into a scatter.
+A slot holds one unroll of all lanes; a full buffer overwrites its oldest slot. `inserted` must stay unbatched where
+members are vmapped: a batched cursor turns the slice update into a scatter.
 """
 
 from typing import NamedTuple
@@ -11,45 +11,45 @@ import jax
 import jax.numpy as jnp
 
 
-class Ring(NamedTuple):
+class ReplayBuffer(NamedTuple):
     data: chex.ArrayTree  # leaves [slots, N, T, ...]
     inserted: chex.Array  # int32 []: unrolls ever added
 
 
-def create(unroll: chex.ArrayTree, slots: int) -> Ring:
-    """An empty ring for unrolls like `unroll` (leaves [N, T, ...], arrays or shape structs)."""
-    return Ring(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), unroll), jnp.int32(0))
+def create(unroll: chex.ArrayTree, slots: int) -> ReplayBuffer:
+    """An empty buffer for unrolls like `unroll` (leaves [N, T, ...], arrays or shape structs)."""
+    return ReplayBuffer(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), unroll), jnp.int32(0))
 
 
-def add(ring: Ring, unroll: chex.ArrayTree) -> Ring:
+def add(buffer: ReplayBuffer, unroll: chex.ArrayTree) -> ReplayBuffer:
     """Write `unroll` (leaves [N, T, ...]) into the next slot."""
-    slots = jax.tree.leaves(ring.data)[0].shape[0]
-    slot = ring.inserted % slots
+    slots = jax.tree.leaves(buffer.data)[0].shape[0]
+    slot = buffer.inserted % slots
     data = jax.tree.map(
-        lambda d, x: jax.lax.dynamic_update_index_in_dim(d, x.astype(d.dtype), slot, 0), ring.data, unroll
+        lambda d, x: jax.lax.dynamic_update_index_in_dim(d, x.astype(d.dtype), slot, 0), buffer.data, unroll
     )
-    return Ring(data, ring.inserted + 1)
+    return ReplayBuffer(data, buffer.inserted + 1)
 
 
-def draw(ring: Ring, keys: chex.PRNGKey, minibatches: int, each: int) -> chex.Array:
+def sample(buffer: ReplayBuffer, keys: chex.PRNGKey, minibatches: int, each: int) -> chex.Array:
     """Indices of trajectories (slot, lane); int32 [minibatches, S·each] for `keys` [S].
 
-    The ring's lanes are S shards of neighbours. Each puts `each` trajectories of its own into every minibatch, drawn
-    by its own key, uniformly with replacement over the filled slots: so a shard's share is the same whatever other
-    shards are in the ring with it. The ring must hold at least one unroll. Drawn for many minibatches at once: a draw
-    costs far more to compile, and more to run, than the gather.
+    The buffer's lanes are S shards of neighbors. Each shard draws `each` trajectories of its own for every minibatch,
+    by its own key, uniformly with replacement over the filled slots (uneven by n/2³² of n trajectories): so its share
+    does not depend on other shards. The buffer must hold at least one unroll. All minibatches are drawn at once: a draw
+    costs far more to compile and to run than the gather.
     """
-    slots, lanes = jax.tree.leaves(ring.data)[0].shape[:2]
+    slots, lanes = jax.tree.leaves(buffer.data)[0].shape[:2]
     shards = keys.shape[0]
     width = lanes // shards
-    filled = jnp.minimum(ring.inserted, slots)
+    filled = jnp.minimum(buffer.inserted, slots)
     bits = jax.vmap(lambda key: jax.random.bits(key, (minibatches, each)))(keys)
-    drawn = (bits % (filled * width).astype(jnp.uint32)).astype(jnp.int32)  # uneven by less than a part in a million
+    drawn = (bits % (filled * width).astype(jnp.uint32)).astype(jnp.int32)
     first = jnp.arange(shards, dtype=jnp.int32)[:, None, None] * width
     index = drawn // width * lanes + first + drawn % width
     return jnp.swapaxes(index, 0, 1).reshape(minibatches, -1)
 
 
-def gather(ring: Ring, index: chex.Array) -> chex.ArrayTree:
+def gather(buffer: ReplayBuffer, index: chex.Array) -> chex.ArrayTree:
     """The trajectories at `index` [B]; leaves [B, T, ...]."""
-    return jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[index], ring.data)
+    return jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[index], buffer.data)

@@ -6,24 +6,24 @@ import chex
 import jax
 import jax.numpy as jnp
 
-LEAST_STD = 1e-6  # of a feature that does not vary
+MIN_STD = 1e-6  # of a feature that does not vary
 
 
-class Statistics(NamedTuple):
-    """Of all observations so far. float32 throughout: after some 10¹⁰ of them the next ones hardly count."""
+class RunningStatistics(NamedTuple):
+    """Of all observations so far. float32: after some 10¹⁰ of them, new ones hardly count."""
 
-    n: chex.Array  # [] how many
+    n: chex.Array  # [] number of observations
     mean: chex.Array  # [F]
     variance: chex.Array  # [F] about `mean`; 1 before the first
 
 
-def none_yet(size: int) -> Statistics:
+def init(size: int) -> RunningStatistics:
     """Of no observations: mean 0, variance 1."""
-    return Statistics(jnp.float32(0.0), jnp.zeros(size), jnp.ones(size))
+    return RunningStatistics(jnp.float32(0.0), jnp.zeros(size), jnp.ones(size))
 
 
-def merged(before: Statistics, batch: chex.Array, axis: str | None = None) -> Statistics:
-    """`before` with a batch [B, F], of which each device of the mesh axis `axis` has a part of equal size."""
+def update(before: RunningStatistics, batch: chex.Array, axis: str | None = None) -> RunningStatistics:
+    """`before` merged with a batch [B, F], of which each device of the mesh axis `axis` has an equal part."""
 
     def over_devices(x: chex.Array) -> chex.Array:
         return jax.lax.pmean(x, axis) if axis else x
@@ -31,15 +31,15 @@ def merged(before: Statistics, batch: chex.Array, axis: str | None = None) -> St
     size = batch.shape[0] * (jax.lax.axis_size(axis) if axis else 1)
     mean = over_devices(batch.mean(axis=0))
     variance = over_devices(jnp.square(batch - mean).mean(axis=0))
-    share = size / (before.n + size)  # of the batch in the whole
-    apart = mean - before.mean
-    return Statistics(
+    share = size / (before.n + size)  # of the batch in all
+    delta = mean - before.mean
+    return RunningStatistics(
         n=before.n + size,
-        mean=before.mean + share * apart,
-        variance=(1.0 - share) * before.variance + share * (variance + (1.0 - share) * jnp.square(apart)),
+        mean=before.mean + share * delta,
+        variance=(1.0 - share) * before.variance + share * (variance + (1.0 - share) * jnp.square(delta)),
     )
 
 
-def deviation(of: Statistics) -> chex.Array:
-    """Standard deviations [F], at least LEAST_STD."""
-    return jnp.maximum(jnp.sqrt(of.variance), LEAST_STD)
+def std(statistics: RunningStatistics) -> chex.Array:
+    """Standard deviations [F], at least MIN_STD."""
+    return jnp.maximum(jnp.sqrt(statistics.variance), MIN_STD)

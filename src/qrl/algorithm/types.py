@@ -1,4 +1,4 @@
-"""Values that flow between rollout, ring buffer and learner, and what the learner takes for an environment."""
+"""Values that flow between rollout, replay buffer and learner, and what an environment is."""
 
 from typing import Any, NamedTuple, Protocol
 
@@ -6,7 +6,7 @@ import chex
 
 
 class State(Protocol):
-    """`brax.envs.State`, or what has its fields; any pytree will do as the physics' state."""
+    """`brax.envs.State`, or any class with its fields; `pipeline_state` may be any pytree."""
 
     @property
     def pipeline_state(self) -> Any: ...
@@ -24,7 +24,12 @@ class State(Protocol):
 
 
 class Env(Protocol):
-    """`brax.envs.Env`, or what has its methods, with flat observations. (Brax itself takes seconds to import.)"""
+    """`brax.envs.Env`, or any class with its methods, with flat observations. (Brax itself takes seconds to import.)
+
+    An action is in [−1, 1]ⁿ. `done` is 1 at the end of an episode: a termination, or a truncation where `info` says so
+    by "truncation" (Brax's name) or "truncated". `info["out_of_bounds"]` marks a truncation at states from which no
+    transition begins.
+    """
 
     def reset(self, rng: chex.PRNGKey) -> State: ...
     def step(self, state: Any, action: chex.Array) -> State: ...
@@ -34,6 +39,46 @@ class Env(Protocol):
     def action_size(self) -> int: ...
 
 
+class Symmetry(Protocol):
+    """A symmetry of a task as matrices: step(S_o·o, S_a·a) = S_o·step(o, a), with the same reward."""
+
+    @property
+    def observation(self) -> chex.Array: ...  # S_o [F, F]
+    @property
+    def action(self) -> chex.Array: ...  # S_a [A, A]
+
+
+class Evaluation(Protocol):
+    """How a task is judged: fly `env` for `steps`, add up the first `return_steps` rewards, then `measure`."""
+
+    @property
+    def env(self) -> Env: ...
+    @property
+    def steps(self) -> int: ...
+    @property
+    def return_steps(self) -> int: ...
+    @property
+    def measure(self) -> Any: ...  # observations [steps + 1, F] -> named scalars; None: nothing is measured
+
+
+class TaskEnv(Env, Protocol):
+    """An environment with all abilities that qrl can use; `adapter.adapt` supplies those that an `Env` lacks."""
+
+    @property
+    def params(self) -> Any: ...  # pytree of arrays that sweeps may vary; () for none
+    @property
+    def episode_steps(self) -> int: ...  # maximum length of an episode
+    @property
+    def control_period_s(self) -> float | None: ...  # None: unknown
+    @property
+    def differentiable(self) -> bool: ...  # step and reward, as APG needs
+    def with_params(self, params: Any) -> "TaskEnv": ...  # of the same structure; may be tracers
+    def restart(self, state: Any, rng: chex.PRNGKey) -> State: ...  # a fresh start that keeps the state's parameters
+    def reset_calibration(self, rng: chex.PRNGKey) -> State: ...  # a start that a deployed policy must cope with
+    def symmetry(self, u: chex.Array) -> Symmetry | None: ...  # a random one, drawn with u [2] in [0, 1)
+    def evaluation(self) -> Evaluation | None: ...  # None: one episode, nothing measured
+
+
 class Transition(NamedTuple):
     """What Algorithm 2 records of a step; leading axes as the holder says ([T, N], [slots, N, T], …)."""
 
@@ -41,10 +86,10 @@ class Transition(NamedTuple):
     action: chex.Array  # [..., A] as drawn from mu, not clipped
     log_mu: chex.Array  # [...] log-density of `action` under the policy that drew it
     reward: chex.Array  # [...]
-    next_observation: chex.Array  # [..., F] after the step, before any reset: the next `observation` but at an end
+    next_observation: chex.Array  # [..., F] after the step, before any reset
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
-    out_of_bounds: chex.Array  # [...] float 0 or 1: truncated where no transition of the environment begins any more
+    out_of_bounds: chex.Array  # [...] float 0 or 1: truncated where no transition of the environment begins
 
 
 class Networks(NamedTuple):

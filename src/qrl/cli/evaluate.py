@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from qrl import tasks
-from qrl.algorithm.flights import Flights, summarise
+from qrl.algorithm.flights import Flights, summarize
 from qrl.algorithm.learner import LearnerState
 from qrl.cli import tables
 from qrl.cli.terminal import DONE, console
@@ -113,7 +113,7 @@ def _saved(run: Run, seed: int, most: int) -> Iterator[tuple[LearnerState, int]]
     """Learner and environment steps of a seed's checkpoints, newest first."""
     folder = record.members(run.folder, run.config)[seed]
     try:
-        yield from restore.newest(run.policies.trainer.learner, run.config.member(seed), folder, most)
+        yield from restore.iter_learners(run.policies.trainer.setup.spec, run.config.member(seed), folder, most)
     except OSError as error:
         raise BadInput(str(error)) from None
 
@@ -123,8 +123,8 @@ def _evaluated(run: Run, seed: int, most: int, task: Task | None) -> tuple[dict[
     saved = _saved(run, seed, most)
     learner, env_steps = next(saved)
     flights = run.policies.fly(learner)
-    last = {"env_steps": env_steps, **summarise(flights)}
-    earlier = [{"env_steps": steps, **summarise(run.policies.fly(learner))} for learner, steps in saved]
+    last = {"env_steps": env_steps, **summarize(flights)}
+    earlier = [{"env_steps": steps, **summarize(run.policies.fly(learner))} for learner, steps in saved]
     result: dict[str, Any] = {"seed": run.config.seed + seed, "starts": len(flights.returns), **last}
     if task:
         success, observations = np.asarray(flights.measures["success"]), np.asarray(flights.observations)
@@ -133,7 +133,7 @@ def _evaluated(run: Run, seed: int, most: int, task: Task | None) -> tuple[dict[
     if most > 1:
         result["checkpoints"] = [last, *earlier]
     if off := run.policies.off_nominal(learner):
-        result["off_nominal"] = {name: summarise(there) for name, there in off.items()}
+        result["off_nominal"] = {name: summarize(there) for name, there in off.items()}
     return result, flights
 
 
@@ -141,9 +141,9 @@ def _flown(baselines: Baselines | None, others: list[Run]) -> Flown:
     flown = Flown({}, {}, {})
     for name, there in (baselines.fly() if baselines else {}).items():
         flown.flights[name] = there.pop(NOMINAL)
-        flown.baselines[name] = summarise(flown.flights[name])
+        flown.baselines[name] = summarize(flown.flights[name])
         if there:
-            flown.baselines[name]["off_nominal"] = {world: summarise(flights) for world, flights in there.items()}
+            flown.baselines[name]["off_nominal"] = {world: summarize(flights) for world, flights in there.items()}
     for run in others:
         for i, folder in enumerate(record.members(run.folder, run.config)):
             result, flown.flights[str(folder)] = _evaluated(run, i, 1, None)

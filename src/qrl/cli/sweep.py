@@ -21,8 +21,8 @@ from qrl.sweep.grid import Grid
 from qrl.sweep.runner import ChunkDone, Compiling, Group, Member
 from qrl.training import devices, multihost
 from qrl.training.multihost import Process
-from qrl.training.state import point
-from qrl.training.trainer import Trainer
+from qrl.training.state import member_inputs
+from qrl.training.trainer import make_trainer
 from qrl_envs.specfile import BadInput, read
 
 SHOWN = 20  # points in the table on the terminal
@@ -98,11 +98,11 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
         first = grid.points[indices[0]]
         env = tasks.environment(first.task)
         tasks.check(env, first.learner, f"{path}: at {grids.said(first.place)}")
-        points = {i: point(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
+        points = {i: member_inputs(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
         members = [
             Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
         ]
-        trainer = Trainer(env, first.learner)
+        trainer = make_trainer(env, first.learner)
         each, workers = members_of.member_bytes(trainer, members[0].point), len(devices.workers())
         if not members_of.chunk_members(len(members), each, budget, workers):
             raise BadInput(

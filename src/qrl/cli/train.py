@@ -30,25 +30,25 @@ PICTURE_FLIGHTS = 5
 def train(args: argparse.Namespace) -> int:
     begun = time.perf_counter()
     process = multihost.this_process(args.process_id, args.processes, args.coordinator, os.environ)
-    console.quiet = process.number != multihost.FIRST
+    console.quiet = process.number != multihost.COORDINATOR
     multihost.join(process)
     with ExitStack() as until_done:
         plan: _Plan | None = None
         wrong: Exception | None = None
-        if not jax.distributed.is_initialized() or multihost.first():
+        if not jax.distributed.is_initialized() or multihost.is_coordinator():
             try:
                 plan = _plan(args, until_done)
             except Exception as error:  # raised once the others, who wait, have heard
                 wrong = error
         code = WRONG_INPUT if isinstance(wrong, BadInput) else FAILED if wrong else DONE
         code, going, held = map(
-            int, multihost.firsts(np.array([code, plan is not None, plan is not None and plan.held]))
+            int, multihost.broadcast(np.array([code, plan is not None, plan is not None and plan.held]))
         )
         if wrong:
             raise wrong
         if not going:
             return code
-        config = RunConfig.model_validate_json(multihost.firsts_text(plan.config.model_dump_json() if plan else ""))
+        config = RunConfig.model_validate_json(multihost.broadcast_text(plan.config.model_dump_json() if plan else ""))
         return _train(config, plan.out if plan else Path(), bool(held), args, begun)
 
 
@@ -78,7 +78,7 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
             console.print(f"{out}: finished already; nothing to do")
             return None
     if not jax.distributed.is_initialized():  # others, who do not know the run yet, have a device each
-        processes.use_cores(config, config.devices if held else file.devices)
+        processes.configure_cpu(config, config.devices if held else file.devices)
     if not held:
         config = config.model_copy(update={"devices": devices.device_names()})
     elif changed := request.changed_since(config):
@@ -97,7 +97,9 @@ def _plan(args: argparse.Namespace, until_done: ExitStack) -> _Plan | None:
 
 def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, begun: float) -> int:
     seeds = f"seed {config.seed}" if config.seeds == 1 else f"{config.seeds} seeds from {config.seed}"
-    console.print(f"{config.task.name}: {_steps(config.learner)}, {seeds}, on {devices.devices(config)} -> {out}")
+    console.print(
+        f"{config.task.name}: {_steps(config.learner)}, {seeds}, on {devices.describe_devices(config)} -> {out}"
+    )
     env = tasks.environment(config.task)
     with stop_requested() as stopped:
         finished = _follow(loop.train(env, config, out, resume=held, stopped=stopped), config)
@@ -105,7 +107,7 @@ def _train(config: RunConfig, out: Path, held: bool, args: argparse.Namespace, b
         what = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
         console.print(f"stopped and saved; to go on: make train {what} OUT={shlex.quote(str(out))} RESUME=1")
         return FAILED
-    if multihost.first():
+    if multihost.is_coordinator():
         _finish(out, config, finished, time.perf_counter() - begun)
     return DONE
 
@@ -158,7 +160,7 @@ def _follow(events: Iterator[loop.Event], config: RunConfig) -> loop.Finished | 
                 console.print("compiling")
             elif isinstance(event, loop.Compiled):
                 console.print(f"compiled in {time.perf_counter() - started:.1f} s\n{_HEADER}")
-            elif isinstance(event, loop.GoingOn):
+            elif isinstance(event, loop.Resumed):
                 for note in event.notes:
                     complain(f"warning: {note}")
                 whence = f"step {event.env_steps:,}" if event.env_steps else "the start: no checkpoint is whole"

@@ -14,8 +14,8 @@ from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED, STARTS
 from qrl.runs import files, record
 from qrl.runs.record import RunConfig
 from qrl.training import restore
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import Trainer, make_trainer
 from qrl_envs import viewer
 from qrl_envs.specfile import BadInput
 from qrl_envs.viewer import Flown
@@ -36,7 +36,7 @@ def view(args: argparse.Namespace) -> int:
         raise BadInput(f"{args.run}: --out: holds {config.seeds} seeds; name one of them, such as {folders[0]}")
     asked = _asked(args.starts) if args.starts else None
     task = tasks.spec(config.task)
-    trainer = Trainer(tasks.environment(config.task), config.learner)
+    trainer = make_trainer(tasks.environment(config.task), config.learner)
     for i, folder in enumerate(folders):
         member, starts = config.member(i), asked or _varied(folder)
         env_steps, flights = _flown(trainer, member, folder, starts)
@@ -72,9 +72,9 @@ def _flown(trainer: Trainer, config: RunConfig, folder: Path, starts: list[int])
     """Environment steps of a seed's last checkpoint, and its flights in NumPy; leading axis: starts."""
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
     even = np.resize(starts, -(-len(starts) // LANES) * LANES)
-    points = stack([point(trainer.env, config.learner)])
+    points = stack([member_inputs(trainer.setup.env, config.learner)])
     try:
-        learner, env_steps = next(restore.newest(trainer.learner, config, folder, 1))
+        learner, env_steps = next(restore.iter_learners(trainer.setup.spec, config, folder, 1))
     except OSError as error:
         raise BadInput(str(error)) from None
     flights = trainer.fly(learner, points, keys[even])

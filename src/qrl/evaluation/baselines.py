@@ -18,8 +18,8 @@ from qrl.algorithm.learner import LearnerState
 from qrl.algorithm.types import Env
 from qrl.config import Config
 from qrl.training import restore
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer, xla_effort
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer, xla_effort
 from qrl_envs.controllers import geometric, lqr
 from qrl_envs.task import QuadrotorTask
 
@@ -42,8 +42,8 @@ class Policies:
     """The policies of one configuration in every world; compiling begins when this is made."""
 
     def __init__(self, worlds: Worlds, config: Config, aside: Executor) -> None:
-        self.trainer = Trainer(worlds.nominal, config)
-        self._points = {name: stack([point(env, config)]) for name, env in _named(worlds).items()}
+        self.trainer = make_trainer(worlds.nominal, config)
+        self._points = {name: stack([member_inputs(env, config)]) for name, env in _named(worlds).items()}
         self._programs = _each_kind(worlds, lambda env: aside.submit(_compiled_policy, env, config, worlds.starts))
         self._starts = worlds.starts
 
@@ -87,8 +87,8 @@ def _each_kind(worlds: Worlds, compiling: Callable[[Env], Future]) -> dict[str, 
 
 
 def _compiled_policy(env: Env, config: Config, starts: chex.PRNGKey) -> Program:
-    trainer, points = Trainer(env, config), stack([point(env, config)])
-    one = restore.learner_shapes(trainer.learner)
+    trainer, points = make_trainer(env, config), stack([member_inputs(env, config)])
+    one = restore.abstract_learner(trainer.setup.spec)
     learners = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), one)
     return trainer.fly.lower(learners, points, starts).compile()
 
@@ -106,6 +106,6 @@ def _controllers(task: QuadrotorTask) -> dict[str, Callable[[chex.Array], chex.A
 
 def _compiled_controllers(env: Any, made: Future, starts: chex.PRNGKey) -> Program:
     def fly(params: Any, keys: chex.PRNGKey) -> dict[str, Flights]:
-        return {name: evaluate.fly(env.under(params), each, keys, 0) for name, each in made.result().items()}
+        return {name: evaluate.fly(env.with_params(params), each, keys, 0) for name, each in made.result().items()}
 
     return jax.jit(fly, compiler_options=xla_effort(1)).lower(env.params, starts).compile()

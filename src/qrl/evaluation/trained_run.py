@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from qrl import tasks
 from qrl.algorithm import flights as evaluate
-from qrl.algorithm.flights import Flights, summarise
-from qrl.algorithm.learner import MAX_NORMALISED
-from qrl.algorithm.running_statistics import deviation
+from qrl.algorithm import learner
+from qrl.algorithm.adapter import adapt
+from qrl.algorithm.flights import Flights, summarize
+from qrl.algorithm.learner import MAX_NORMALIZED
+from qrl.algorithm.running_statistics import std
 from qrl.algorithm.types import Env, State
 from qrl.export import baseline, emit
 from qrl.export import kernel as integer
@@ -30,7 +32,8 @@ from qrl.export.quantise import Inexpressible, quantise, si_layers
 from qrl.export.report import Flown, Measured, report
 from qrl.runs import record
 from qrl.training import restore
-from qrl.training.state import point, stack
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer
 from qrl_envs import io_spec
 from qrl_envs.specfile import BadInput
 
@@ -55,7 +58,9 @@ class Run:
             raise BadInput(f"{folder}: holds {self.config.seeds} seeds; name one of them, such as RUN={one}")
         self.env: Env = tasks.environment(self.config.task)
         try:
-            self.trainer, self.learner, self.env_steps = restore.last(self.env, self.config, folder)
+            self.trainer = make_trainer(self.env, self.config.learner)
+            found = restore.iter_learners(self.trainer.setup.spec, self.config, folder, 1)
+            self.learner, self.env_steps = next(found)
         except OSError as error:
             raise BadInput(str(error)) from None
         self._task = tasks.spec(self.config.task) if self.config.task.spec else None
@@ -63,7 +68,7 @@ class Run:
 
     def fly(self, starts: chex.PRNGKey) -> Flights:
         """Flights of the float policy as `qrl evaluate` makes them; leading axis: starts."""
-        points = stack([point(self.env, self.config.learner)])
+        points = stack([member_inputs(self.env, self.config.learner)])
         return jax.tree.map(lambda x: np.asarray(x[0]), self.trainer.fly(self.learner, points, starts))
 
     def fly_with(self, policy: Policy, answer: Answer, starts: chex.PRNGKey, envelope: float = 0.0) -> Flights:
@@ -84,21 +89,23 @@ class Run:
             return jax.pure_callback(lambda o: self._ask(o), shape, observation)
 
         def start(env: Env, wide: chex.Array, key: chex.PRNGKey) -> State:
-            return jax.tree.map(
-                lambda a, b: jnp.where(wide, a, b), getattr(env, "meet", env.reset)(key), env.reset(key)
-            )
+            return jax.tree.map(lambda a, b: jnp.where(wide, a, b), adapt(env).reset_calibration(key), env.reset(key))
 
         return evaluate.fly(
-            self.env, mean, starts, self.trainer.longest, lambda env, keys: jax.vmap(partial(start, env))(wide, keys)
+            self.env,
+            mean,
+            starts,
+            self.trainer.setup.max_episode_steps,
+            lambda env, keys: jax.vmap(partial(start, env))(wide, keys),
         )
 
     def policy(self) -> Policy:
         """The policy that ships, with observations of its own flights to calibrate on."""
-        config, learner = self.config.learner, self.trainer.learner
-        shipped = jax.tree.map(lambda x: np.asarray(x[0], np.float64), learner.shipped(self.learner))
+        config, spec = self.config.learner, self.trainer.setup.spec
+        shipped = jax.tree.map(lambda x: np.asarray(x[0], np.float64), learner.deployed(spec, self.learner))
         layers = shipped.params.policy["params"]
-        size = learner.observation_size
-        std = np.asarray(deviation(shipped.statistics))
+        size = spec.observation_size
+        deviation = np.asarray(std(shipped.statistics))
         observed, acted = self._ports()
         policy = Policy(
             origin=self._origin(),
@@ -106,8 +113,8 @@ class Run:
             observed=observed,
             acted=acted,
             observation_offset=shipped.statistics.mean if config.normalize_observations else np.zeros(size),
-            observation_gain=1.0 / std if config.normalize_observations else np.ones(size),
-            observation_clip=MAX_NORMALISED if config.normalize_observations else np.inf,
+            observation_gain=1.0 / deviation if config.normalize_observations else np.ones(size),
+            observation_clip=MAX_NORMALIZED if config.normalize_observations else np.inf,
             observation_scale=np.asarray(config.observation_scale or np.ones(size)),
             layers=tuple((layers[f"Dense_{i}"]["kernel"], layers[f"Dense_{i}"]["bias"]) for i in range(len(layers))),
             activation=config.activation,
@@ -144,7 +151,7 @@ class Run:
     def tail_steps(self) -> int:
         """The last steps of a flight, in which it is judged."""
         if self._task is None:
-            return self.trainer.longest // 4
+            return self.trainer.setup.max_episode_steps // 4
         return round(self._task.evaluation.tail_s / self._task.control_period_s)
 
     def _origin(self) -> Origin:
@@ -181,7 +188,7 @@ def flown(policy: Policy, flights: Flights, tail_steps: int) -> Flown:
     low, high = policy.limits
     actions = policy.in_units(np.asarray(flights.actions[:, -tail_steps:])) / (high - low)
     return Flown(
-        summary=summarise(flights),
+        summary=summarize(flights),
         success=np.asarray(flights.measures["success"]) > 0.5 if "success" in flights.measures else None,
         jitter=float(np.abs(np.diff(actions, axis=1)).mean()),
         starts=len(flights.returns),

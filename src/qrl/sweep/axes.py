@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from qrl.algorithm.learner import Terms
+from qrl.algorithm.learner import UpdateMetrics
 from qrl.config import Config
 from qrl.runs.record import TaskRecord
 from qrl_envs import specfile
@@ -19,7 +19,7 @@ DIGITS = 6  # to which the values of a range are rounded: enough to tell them ap
 # What a table of results calls its own columns; and whatever begins so.
 COLUMNS = (
     *("point", "seed", "seeds", "diverged", "env_steps", "updates", "return_mean", "return_min", "success"),
-    *("train_seconds", "steps_per_second", "reward_mean", "ended_early", *Terms._fields),
+    *("train_seconds", "steps_per_second", "reward_mean", "ended_early", *UpdateMetrics._fields),
 )
 MEASURES = ("settle_", "rms_")
 JUDGED = "task.evaluation"  # the same for all points, else they could not be compared

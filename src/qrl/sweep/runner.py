@@ -23,7 +23,7 @@ from jax.sharding import SingleDeviceSharding
 
 from qrl.runs.files import Row, replace_text
 from qrl.training import driver
-from qrl.training.state import Point, stack
+from qrl.training.state import MemberInputs, stack
 from qrl.training.trainer import Trainer
 
 # A CPU takes the members of a chunk one after the other: more gain no speed, and are what an interruption loses.
@@ -35,7 +35,7 @@ class Member(NamedTuple):
 
     number: int  # in the whole sweep: point · seeds + seed's place
     seed: int
-    point: Point
+    point: MemberInputs
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class ChunkDone:
     seconds: float
 
 
-def member_bytes(trainer: Trainer, point: Point) -> int:
+def member_bytes(trainer: Trainer, point: MemberInputs) -> int:
     """What a member needs: its state, once more where the program writes it, and its flights."""
     seeds, points = _like([Member(0, 0, point)], 1, None)
     states = jax.eval_shape(trainer.init, seeds, points)
@@ -185,10 +185,9 @@ def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -
         jax.eval_shape(trainer.init, seeds, points),
     )
     advance, climb, fly = (
-        compiled(trainer, states, points)
-        for compiled in (driver.compile_advance, driver.compile_climb, driver.compile_fly)
+        compiled(trainer, states, points) for compiled in (driver.compile_train, driver.compile_apg, driver.compile_fly)
     )
-    return trainer.init.lower(seeds, points).compile(), driver.Programs(advance, lambda: climb, fly, trainer.on_host)
+    return trainer.init.lower(seeds, points).compile(), driver.Programs(advance, lambda: climb, fly, trainer.gather)
 
 
 def _chunk(
@@ -208,7 +207,7 @@ def _chunk(
     states = programs[0](seeds, points)
     rows: list[list[Row]] = [[] for _ in members]
     faults: list[str] = []
-    for lap in driver.laps(states, points, programs[1], group.trainer.config, driver.Clock(), halted):
+    for lap in driver.run_chunks(states, points, programs[1], group.trainer.config, driver.Clock(), halted):
         faults, env_steps = lap.faults, lap.env_steps * len(members)
         for kept, row in zip(rows, lap.rows, strict=False):  # what fills the chunk up is not kept
             share = {"train_seconds": round(row["train_seconds"] / len(members), 3)}

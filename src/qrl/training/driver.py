@@ -1,4 +1,4 @@
-"""Training as the host sees it: members advance lap by lap, and every so often a report is due."""
+"""The host's side of training: run the compiled programs in chunks, and make the reports that are due."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -9,20 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from qrl.algorithm.flights import Flights, summarise
+from qrl.algorithm.flights import Flights, summarize
 from qrl.algorithm.learner import LearnerState
 from qrl.config import Config
 from qrl.runs.files import Row
 from qrl.training import multihost
-from qrl.training.state import FAULT_TERMS, Point, Totals, TrainState
+from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
 from qrl.training.trainer import Trainer
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
-CHUNK_SECONDS = 1.0  # how long the device works between two signs of life
+CHUNK_SECONDS = 1.0  # target duration of one call of a compiled program
 
 
 class NotFinite(RuntimeError):
-    """A number in training is not finite; the message says which, where and what was kept."""
+    """A number in training is not finite; the message says which, when, and which checkpoint is kept."""
 
 
 class Clock(NamedTuple):
@@ -33,42 +33,42 @@ class Clock(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Lap:
-    """Members have come this far; `states` are alive until the next lap is asked for."""
+class Chunk:
+    """The members after one call of a program; `states` are valid until the next chunk is asked for."""
 
     states: TrainState
     env_steps: int
     steps_per_second: float
     seconds_left: float
     clock: Clock
-    rows: list[Row]  # where a report is due: one for each member
-    faults: list[str]  # of each member, what was first not finite in its training, and when; "": nothing
+    rows: list[Row]  # one for each member where a report is due, else none
+    faults: list[str]  # of each member: what was first not finite, and when; "": nothing
 
 
-Advance = Callable[[TrainState, Point, np.int32], TrainState]
+Program = Callable[[TrainState, MemberInputs, np.int32], TrainState]
 
 
 @dataclass(frozen=True)
 class Programs:
     """A trainer's programs, compiled for a number of members."""
 
-    advance: Advance
-    climb: Callable[[], Advance]  # asked for when it is needed, so that it may still be compiling before
-    fly: Callable[[LearnerState, Point, jax.Array], Flights]
-    on_host: Callable[[Any], Any]
+    train: Program
+    apg: Callable[[], Program]  # called when it is needed, since it may still be compiling
+    fly: Callable[[LearnerState, MemberInputs, jax.Array], Flights]
+    gather: Callable[[Any], Any]
 
 
-def compile_advance(trainer: Trainer, states: TrainState, points: Point) -> Any:
-    return trainer.advance.lower(states, points, np.int32(0)).compile()
+def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
+    return trainer.train.lower(states, inputs, np.int32(0)).compile()
 
 
-def compile_climb(trainer: Trainer, states: TrainState, points: Point) -> Any:
-    """Of the run's last part; None where it has none."""
-    return trainer.climb.lower(states, points, np.int32(0)).compile() if trainer.config.num_apg_updates else None
+def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
+    """None for a run without APG."""
+    return trainer.apg.lower(states, inputs, np.int32(0)).compile() if trainer.config.num_apg_updates else None
 
 
-def compile_fly(trainer: Trainer, states: TrainState, points: Point) -> Any:
-    return trainer.fly.lower(states.learner, points, report_starts(trainer.config)).compile()
+def compile_fly(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
+    return trainer.fly.lower(states.learner, inputs, report_starts(trainer.config)).compile()
 
 
 def seeds(first: int, count: int) -> np.ndarray:
@@ -80,54 +80,48 @@ def report_starts(config: Config) -> jax.Array:
     return jax.random.split(jax.random.PRNGKey(REPORT_STARTS_SEED), config.num_eval_envs)
 
 
-def laps(
+def run_chunks(
     states: TrainState,
-    points: Point,
+    inputs: MemberInputs,
     programs: Programs,
     config: Config,
     clock: Clock,
     stopped: Callable[[], bool],
-    hear: Callable[[float], np.ndarray] = multihost.alone,
-) -> Iterator[Lap]:
-    """Advance all members to the end or until `stopped()`, a lap about CHUNK_SECONDS.
+    all_gather: Callable[[float], np.ndarray] = multihost.single_process,
+) -> Iterator[Chunk]:
+    """Train all members to the end or until `stopped()`, in chunks of about CHUNK_SECONDS.
 
-    Processes that share the members have to make the same laps: `hear` tells what each of them says.
+    Processes that share the members must make the same chunks: `all_gather` gives a value of each process.
     """
-    done = first = int(programs.on_host(states.unrolls)[0])
+    done = first = int(programs.gather(states.unrolls)[0])
     count, starts = len(states.unrolls), report_starts(config)
-    began = time.perf_counter()
-    chunk = 1
-    while done < config.num_unrolls and not hear(stopped()).any():
+    start_time = time.perf_counter()
+    size = 1
+    while done < config.num_unrolls and not all_gather(stopped()).any():
         due = (done // config.unrolls_per_eval + 1) * config.unrolls_per_eval
         report_at = config.align_to_apg_update(min(config.num_unrolls, due))
         learning = done < config.learning_unrolls
-        until = min(
-            report_at,
-            config.learning_unrolls if learning else config.num_unrolls,
-            config.align_to_apg_update(done + chunk),
-        )
-        advance = programs.advance if learning else programs.climb()
-        started = time.perf_counter()
-        states = jax.block_until_ready(advance(states, points, np.int32(until)))
-        lap = float(hear(time.perf_counter() - started)[multihost.FIRST])
-        clock = Clock(clock.train_seconds + lap, clock.report_seconds + lap)
-        chunk = max(1, round((until - done) * CHUNK_SECONDS / lap))
-        speed = (until - done) * config.steps_per_unroll * count / lap
+        end = config.learning_unrolls if learning else config.num_unrolls
+        until = min(report_at, end, config.align_to_apg_update(done + size))
+        program = programs.train if learning else programs.apg()
+        chunk_start = time.perf_counter()
+        states = jax.block_until_ready(program(states, inputs, np.int32(until)))
+        seconds = float(all_gather(time.perf_counter() - chunk_start)[multihost.COORDINATOR])
+        clock = Clock(clock.train_seconds + seconds, clock.report_seconds + seconds)
+        size = max(1, round((until - done) * CHUNK_SECONDS / seconds))
+        speed = (until - done) * config.steps_per_unroll * count / seconds
         done = until
-        left = (
-            (time.perf_counter() - began)
-            * config.estimated_cost(done, config.num_unrolls)
-            / config.estimated_cost(first, done)
-        )
-        faults = _faults(programs.on_host((states.fault_update, states.fault_term)))
+        made, ahead = config.estimated_cost(first, done), config.estimated_cost(done, config.num_unrolls)
+        seconds_left = (time.perf_counter() - start_time) * ahead / made
+        faults = _faults(programs.gather((states.fault_update, states.fault_term)))
         rows: list[Row] = []
         if done == report_at:
-            flights = programs.on_host(programs.fly(states.learner, points, starts))
-            updates, totals = programs.on_host((states.learner.updates, states.totals))
-            rows = _rows(config, done * config.steps_per_unroll, updates, totals, flights, clock)
+            flights = programs.gather(programs.fly(states.learner, inputs, starts))
+            updates, totals = programs.gather((states.learner.updates, states.totals))
+            rows = _rows(done * config.steps_per_unroll, updates, totals, flights, clock)
             clock = clock._replace(report_seconds=0.0)
             states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
-        yield Lap(states, done * config.steps_per_unroll, speed, left, clock, rows, faults)
+        yield Chunk(states, done * config.steps_per_unroll, speed, seconds_left, clock, rows, faults)
 
 
 def _faults(found: tuple[np.ndarray, np.ndarray]) -> list[str]:
@@ -137,13 +131,11 @@ def _faults(found: tuple[np.ndarray, np.ndarray]) -> list[str]:
     ]
 
 
-def _rows(
-    config: Config, env_steps: int, updates: np.ndarray, totals: Totals, flights: Flights, clock: Clock
-) -> list[Row]:
+def _rows(env_steps: int, updates: np.ndarray, totals: Totals, flights: Flights, clock: Clock) -> list[Row]:
     rows: list[Row] = []
     for i in range(len(updates)):
         count = max(float(totals.updates[i]), 1.0)
-        summary = summarise(jax.tree.map(lambda x, i=i: x[i], flights))
+        summary = summarize(jax.tree.map(lambda x, i=i: x[i], flights))
         rows.append(
             {
                 "env_steps": env_steps,
@@ -153,7 +145,7 @@ def _rows(
                 **summary,
                 "reward_mean": float(totals.rewards[i] / max(float(totals.steps[i]), 1.0)),
                 "ended_early": float(totals.early[i] / max(float(totals.episodes[i]), 1.0)),
-                **{name: float(value[i]) / count for name, value in totals.terms._asdict().items()},
+                **{name: float(value[i]) / count for name, value in totals.metrics._asdict().items()},
                 "steps_per_second": round(float(totals.steps.sum()) / clock.report_seconds, 1),
             }
         )

@@ -1,4 +1,4 @@
-"""A run from start to end on the host: compile, advance, report, record, save; stop and go on."""
+"""A run on the host: compile, train, report, record and save; stop and resume."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,36 +11,23 @@ import numpy as np
 
 from qrl.algorithm.flights import Flights
 from qrl.algorithm.types import Env
-from qrl.runs import checkpoint, files
-from qrl.runs import record as runs
+from qrl.runs import checkpoint, files, record
 from qrl.runs.checkpoint import Checkpoint
 from qrl.runs.files import Row
 from qrl.runs.integrity import Record
 from qrl.runs.record import RunConfig
 from qrl.runs.tensorboard import EventLog
-from qrl.training import multihost, restore
-from qrl.training.driver import (
-    Clock,
-    Lap,
-    NotFinite,
-    Programs,
-    compile_advance,
-    compile_climb,
-    compile_fly,
-    laps,
-    report_starts,
-    seeds,
-)
-from qrl.training.sharding import spread
-from qrl.training.state import point, stack
-from qrl.training.trainer import Trainer
+from qrl.training import driver, multihost, restore, sharding
+from qrl.training.driver import Chunk, Clock, NotFinite, Programs
+from qrl.training.state import TrainState, member_inputs, stack
+from qrl.training.trainer import Trainer, make_trainer
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
 
 
 @dataclass(frozen=True)
-class GoingOn:
-    """Training goes on from a checkpoint, or from the start where none was whole."""
+class Resumed:
+    """Training resumes from a checkpoint, or from the start where none is valid."""
 
     env_steps: int
     notes: list[str]  # what was wrong with later ones
@@ -53,12 +40,12 @@ class Compiling:
 
 @dataclass(frozen=True)
 class Compiled:
-    """Compiled, and all else is ready to train."""
+    """Compiled, and ready to train."""
 
 
 @dataclass(frozen=True)
 class Progress:
-    """A sign of life between reports."""
+    """A heartbeat between reports."""
 
     env_steps: int
     steps_per_second: float
@@ -67,7 +54,7 @@ class Progress:
 
 @dataclass(frozen=True)
 class Reported:
-    """A report was made and recorded, and is being saved."""
+    """A report is recorded, and its checkpoint is being saved."""
 
     rows: list[Row]  # one for each seed
     seconds_left: float
@@ -75,24 +62,24 @@ class Reported:
 
 @dataclass(frozen=True)
 class Finished:
-    """All steps are made and saved; the policies that ship, flown once more from the reports' starts."""
+    """All steps are made and saved; the deployed policies' flights from the reports' starts."""
 
     flights: Flights  # leading axis: seeds
     rows: list[list[Row]]  # of each seed
 
 
-Event = GoingOn | Compiling | Compiled | Progress | Reported | Finished
+Event = Resumed | Compiling | Compiled | Progress | Reported | Finished
 
 
 class Member:
-    """What the host keeps of one seed."""
+    """The run folder of one seed, open for writing."""
 
     def __init__(self, folder: Path, run: RunConfig, env_steps: int, rows: list[Row]) -> None:
         self.folder = folder
         self.rows = rows
         self.checkpoints = checkpoint.Writer(folder, run)
         self._tensorboard = EventLog(folder / "tensorboard", purge_step=env_steps + 1)
-        files.write_metrics(folder, rows)  # those after the checkpoint are cut
+        files.write_metrics(folder, rows)  # rows after the checkpoint are cut
 
     def record(self, row: Row) -> None:
         self.checkpoints.check()
@@ -109,109 +96,115 @@ class Member:
 
 
 def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callable[[], bool]) -> Iterator[Event]:
-    """Train into the run folder(s) of `out`, from the last whole checkpoint if `resume`; yields what happens.
+    """Train into the run folder(s) of `out`, from the last valid checkpoint if `resume`; yields what happens.
 
-    Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept. Where a run
-    has several processes, the first alone reads and writes.
+    Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept. Of several
+    processes only the coordinator reads and writes.
     """
-    trainer = Trainer(env, run.learner, spread(jax.devices(), run.seeds, run.learner.shard_count))
-    points = stack([point(env, run.learner)] * run.seeds)
-    folders = runs.members(out, run) if multihost.first() else []
+    mesh = sharding.make_mesh(jax.devices(), run.seeds, run.learner.shard_count)
+    trainer = make_trainer(env, run.learner, mesh)
+    inputs = stack([member_inputs(env, run.learner)] * run.seeds)
+    folders = record.members(out, run) if multihost.is_coordinator() else []
     configs = [run.member(i) for i in range(run.seeds)]
-    begin, clock, rows = 0, Clock(), [[] for _ in folders]
-    like = restore.shapes(trainer, points)
-    states: Any = None
+    target = restore.abstract_states(trainer, inputs)
+    abstract = sharding.abstract_sharded(mesh, target)
     members: list[Member] = []
-    # Side by side: each takes XLA seconds, and has little use for a second core.
-    aside = ThreadPoolExecutor()
+    executor = ThreadPoolExecutor()  # each compilation takes XLA seconds, and about one core
     try:
         yield Compiling()
-        advance = aside.submit(compile_advance, trainer, trainer.laid_out(like), points)
-        fly = aside.submit(compile_fly, trainer, trainer.laid_out(like), points)
+        compiled_train = executor.submit(driver.compile_train, trainer, abstract, inputs)
+        compiled_fly = executor.submit(driver.compile_fly, trainer, abstract, inputs)
+        begin, states, clock, rows = 0, None, Clock(), [[] for _ in folders]
         if resume:
-            found = restore.latest(folders, configs, like) if folders else restore.Restored(0, None, [], [])
-            begin = int(multihost.firsts(np.int32(found.env_steps)))
-            if found.records:
-                rows = [list(record.rows) for record in found.records]
-                clock = Clock(found.records[0].train_seconds, found.records[0].report_seconds)
-            if begin:
-                empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), like)
-                states = trainer.place(multihost.firsts(found.states if folders else empty))
-                clock = Clock(
-                    *map(float, multihost.firsts(np.array(clock)))
-                )  # the same on all: they have to save together
-            yield GoingOn(begin, found.notes)
-        if not begin:
-            states = trainer.init(seeds(run.seed, run.seeds), points)
+            begin, states, clock, rows, notes = _resume(trainer, folders, configs, target)
+            yield Resumed(begin, notes)
+        if states is None:
+            states = trainer.init(driver.seeds(run.seed, run.seeds), inputs)
         programs = Programs(
-            advance=advance.result(),
-            fly=fly.result(),
-            climb=aside.submit(compile_climb, trainer, trainer.laid_out(like), points).result,  # while training goes on
-            on_host=trainer.on_host,
+            train=compiled_train.result(),
+            fly=compiled_fly.result(),
+            apg=executor.submit(driver.compile_apg, trainer, abstract, inputs).result,  # while training goes on
+            gather=trainer.gather,
         )
         members = [Member(folder, configs[i], begin, rows[i]) for i, folder in enumerate(folders)]
         yield Compiled()
-        saver = _Saver(trainer, run, members, clock)
-        for lap in laps(states, points, programs, run.learner, clock, stopped, multihost.everyones):
-            states, begin = lap.states, lap.env_steps
-            yield saver.heed(lap)
-        saver.end()
+        recorder = _Recorder(trainer, run, members, clock)
+        for chunk in driver.run_chunks(states, inputs, programs, run.learner, clock, stopped, multihost.all_gather):
+            states, begin = chunk.states, chunk.env_steps
+            yield recorder.handle(chunk)
+        recorder.finish()
         if begin == run.learner.num_unrolls * run.learner.steps_per_unroll:
-            flights = programs.on_host(programs.fly(states.learner, points, report_starts(run.learner)))
+            flights = programs.gather(programs.fly(states.learner, inputs, driver.report_starts(run.learner)))
             yield Finished(flights, [member.rows for member in members])
     finally:
-        aside.shutdown(cancel_futures=True)
+        executor.shutdown(cancel_futures=True)
         for member in members:
             member.close()
 
 
-class _Saver:
-    """Records and saves what laps bring."""
+def _resume(
+    trainer: Trainer, folders: list[Path], configs: list[RunConfig], target: TrainState
+) -> tuple[int, TrainState | None, Clock, list[list[Row]], list[str]]:
+    """Environment steps, placed states (None: from the start), clock, rows of each member, and notes."""
+    found = restore.restore_common(folders, configs, target) if folders else restore.Restored(0, None, [], [])
+    begin = int(multihost.broadcast(np.int32(found.env_steps)))
+    rows = [list(record.rows) for record in found.records] or [[] for _ in folders]
+    clock = Clock(found.records[0].train_seconds, found.records[0].report_seconds) if found.records else Clock()
+    if not begin:
+        return 0, None, clock, rows, found.notes
+    empty = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), target)
+    states = sharding.device_put(trainer.setup.mesh, multihost.broadcast(found.states if folders else empty))
+    clock = Clock(*map(float, multihost.broadcast(np.array(clock))))  # the same everywhere: all save together
+    return begin, states, clock, rows, found.notes
+
+
+class _Recorder:
+    """Records and saves chunks."""
 
     def __init__(self, trainer: Trainer, run: RunConfig, members: list[Member], clock: Clock) -> None:
         self._trainer = trainer
         self._run = run
-        self._members = members  # none, where another process writes
-        self._lap: Lap | None = None  # not saved yet
+        self._members = members  # none where another process writes
+        self._unsaved: Chunk | None = None
         self._saved_at = clock.train_seconds
 
-    def heed(self, lap: Lap) -> Progress | Reported:
-        self._check(lap)
-        # The row first: killed between the two, a resumed run cuts it and makes it again.
-        for member, row in zip(self._members, lap.rows, strict=False):
+    def handle(self, chunk: Chunk) -> Progress | Reported:
+        self._check(chunk)
+        # The row first: after a kill between the two, a resumed run cuts it and makes it again.
+        for member, row in zip(self._members, chunk.rows, strict=False):
             member.record(row)
-        self._lap = lap
-        if lap.rows or lap.clock.train_seconds - self._saved_at >= SAVE_SECONDS:
-            self._save(lap)
-        if lap.rows:
-            return Reported(lap.rows, lap.seconds_left)
-        return Progress(lap.env_steps, lap.steps_per_second, lap.seconds_left)
+        self._unsaved = chunk
+        if chunk.rows or chunk.clock.train_seconds - self._saved_at >= SAVE_SECONDS:
+            self._save(chunk)
+        if chunk.rows:
+            return Reported(chunk.rows, chunk.seconds_left)
+        return Progress(chunk.env_steps, chunk.steps_per_second, chunk.seconds_left)
 
-    def end(self) -> None:
-        """Until all is on disk."""
-        if self._lap:
-            self._save(self._lap)
+    def finish(self) -> None:
+        """Save what is not saved, and wait until all is on disk."""
+        if self._unsaved:
+            self._save(self._unsaved)
         for member in self._members:
             member.checkpoints.wait()
 
-    def _save(self, lap: Lap) -> None:
+    def _save(self, chunk: Chunk) -> None:
         for i in range(self._run.seeds):
-            state = self._trainer.member(lap.states, i)
+            state = self._trainer.member(chunk.states, i)
             if self._members:
-                self._members[i].save(lap.env_steps, state, lap.clock)
-        self._lap, self._saved_at = None, lap.clock.train_seconds
+                self._members[i].save(chunk.env_steps, state, chunk.clock)
+        self._unsaved, self._saved_at = None, chunk.clock.train_seconds
 
-    def _check(self, lap: Lap) -> None:
+    def _check(self, chunk: Chunk) -> None:
         for member in self._members:
             member.checkpoints.check()
-        for i, what in enumerate(lap.faults):
-            if what:
-                where, kept = self._kept(i)
-                raise NotFinite(f"{where}seed {self._run.seed + i}: {what}; {kept}")
+        for i, fault in enumerate(chunk.faults):
+            if fault:
+                where, kept = self._last_checkpoint(i)
+                raise NotFinite(f"{where}seed {self._run.seed + i}: {fault}; {kept}")
 
-    def _kept(self, i: int) -> tuple[str, str]:
+    def _last_checkpoint(self, i: int) -> tuple[str, str]:
         if not self._members:
-            return "", "the first process says what is kept"
+            return "", "process 0 reports the last checkpoint"
         member = self._members[i]
         member.checkpoints.wait()
         saved = checkpoint.steps(member.folder)
@@ -220,5 +213,5 @@ class _Saver:
 
 
 def finished(out: Path, run: RunConfig) -> bool:
-    """Whether the run in `out` has nothing left to do: its summaries are written last."""
-    return all((folder / "summary.json").is_file() for folder in {out, *runs.members(out, run)})
+    """Whether the run in `out` is complete: its summaries are written last."""
+    return all((folder / "summary.json").is_file() for folder in {out, *record.members(out, run)})

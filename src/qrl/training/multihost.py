@@ -1,6 +1,6 @@
-"""What the processes of one run tell each other; a process alone hears itself.
+"""The processes of one run: how they join, and what they exchange.
 
-Every process has to call `everyones`, `firsts` and `firsts_text`, in the same order.
+Every process must call `all_gather`, `broadcast` and `broadcast_text` in the same order.
 """
 
 from collections.abc import Mapping
@@ -12,46 +12,46 @@ from jax.experimental import multihost_utils
 
 from qrl_envs.specfile import BadInput
 
-FIRST = 0  # the process that reads and writes the run folder
+COORDINATOR = 0  # the process that reads and writes the run folder
 
 
-def first() -> bool:
-    return jax.process_index() == FIRST
+def is_coordinator() -> bool:
+    return jax.process_index() == COORDINATOR
 
 
-def everyones(value: float) -> np.ndarray:
-    """What each process says here; float32 [processes]."""
+def all_gather(value: float) -> np.ndarray:
+    """The value of each process; float32 [processes]."""
     return np.ravel(multihost_utils.process_allgather(np.float32(value)))
 
 
-def alone(value: float) -> np.ndarray:
-    """The same for a process that has nothing to do with the others."""
+def single_process(value: float) -> np.ndarray:
+    """`all_gather` for a process that shares nothing with others."""
     return np.array([value], np.float32)
 
 
-def firsts(tree: Any) -> Any:
-    """The first process's tree of arrays in NumPy; the others give one of the same structure, shapes and types."""
+def broadcast(tree: Any) -> Any:
+    """The coordinator's tree of arrays in NumPy; the others give one of the same structure, shapes and types."""
     if jax.process_count() == 1:
         return tree
-    leaves, whole = jax.tree.flatten(tree)
+    leaves, treedef = jax.tree.flatten(tree)
     leaves = [np.asarray(leaf) for leaf in leaves]
     # As bytes: JAX broadcasts by a sum in single precision, which would turn −0 into 0 and round a double.
     sent = [np.ascontiguousarray(leaf).reshape(-1).view(np.uint8) for leaf in leaves]
-    heard = multihost_utils.broadcast_one_to_all(sent)
-    return whole.unflatten(
-        [np.asarray(x).view(leaf.dtype).reshape(leaf.shape) for x, leaf in zip(heard, leaves, strict=True)]
+    received = multihost_utils.broadcast_one_to_all(sent)
+    return treedef.unflatten(
+        [np.asarray(x).view(leaf.dtype).reshape(leaf.shape) for x, leaf in zip(received, leaves, strict=True)]
     )
 
 
-def firsts_text(text: str) -> str:
-    """The first process's text, whatever the others give."""
+def broadcast_text(text: str) -> str:
+    """The coordinator's text; the others' is ignored."""
     data = np.frombuffer(text.encode(), np.uint8)
-    size = int(firsts(np.array(len(data))))
-    return firsts(np.resize(data, size) if len(data) else np.zeros(size, np.uint8)).tobytes().decode()
+    size = int(broadcast(np.array(len(data))))
+    return broadcast(np.resize(data, size) if len(data) else np.zeros(size, np.uint8)).tobytes().decode()
 
 
 class Process(NamedTuple):
-    """Which of how many processes this is, and where process 0 listens ("" where the launcher says so itself)."""
+    """Index and number of processes, and the address of process 0 ("" where the launcher gives it)."""
 
     number: int
     of: int
@@ -59,7 +59,7 @@ class Process(NamedTuple):
 
 
 def this_process(index: int | None, count: int | None, coordinator: str | None, env: Mapping[str, str]) -> Process:
-    """From flags, else JAX's variables, else those of a SLURM step (`srun`); alone where nothing is said."""
+    """From flags, else JAX's variables, else those of a SLURM step (`srun`); a single process by default."""
     # Not SLURM_NTASKS: it is set in a batch script too, where only one process runs.
     step = env if "SLURM_STEP_NUM_TASKS" in env else {}
     found = [
@@ -87,9 +87,11 @@ def _number(flag: str, value: int | str | None) -> int | None:
 
 
 def join(process: Process) -> None:
-    """Meet the other processes, where there are any."""
+    """Connect to the other processes, if there are any."""
     if process.of > 1 and not jax.distributed.is_initialized():
         try:
             jax.distributed.initialize(process.coordinator or None, process.of, process.number)
         except (RuntimeError, ValueError) as error:
-            raise OSError(f"process {process.number} of {process.of} cannot meet the others: {error}") from None
+            raise OSError(
+                f"process {process.number} of {process.of} cannot connect to the coordinator: {error}"
+            ) from None

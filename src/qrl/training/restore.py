@@ -1,4 +1,4 @@
-"""From a run folder's checkpoints back to a training state, to go on with, or to its learner alone, to fly."""
+"""From a run folder's checkpoints back to a training state, to resume, or to its learner alone, to fly."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,37 +7,37 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from qrl.algorithm.learner import Learner, LearnerState
-from qrl.algorithm.types import Env
+from qrl.algorithm import learner
+from qrl.algorithm.learner import LearnerSpec, LearnerState
 from qrl.runs import checkpoint
 from qrl.runs.integrity import Damaged, Record
 from qrl.runs.record import RunConfig
 from qrl.training import driver
-from qrl.training.state import Point, TrainState, stack
+from qrl.training.state import MemberInputs, TrainState, stack
 from qrl.training.trainer import Trainer
 
 
 class Restored(NamedTuple):
-    """Where a run goes on."""
+    """Where a run resumes."""
 
-    env_steps: int  # 0: from the start, for nothing whole was saved
+    env_steps: int  # 0: from the start, without a valid checkpoint
     states: TrainState | None  # NumPy; leading axis: members
     records: list[Record]  # of each member
-    notes: list[str]  # what was wrong with later checkpoints, and what became of them
+    notes: list[str]  # what was wrong with later checkpoints, and what was done
 
 
-def shapes(trainer: Trainer, points: Point) -> TrainState:
-    """Shapes and types of the states of as many members as there are `points`."""
-    return jax.eval_shape(trainer.init, driver.seeds(0, len(jax.tree.leaves(points)[0])), points)
+def abstract_states(trainer: Trainer, inputs: MemberInputs) -> TrainState:
+    """Shapes and types of the states of as many members as `inputs` has."""
+    return jax.eval_shape(trainer.init, driver.seeds(0, len(jax.tree.leaves(inputs)[0])), inputs)
 
 
-def latest(folders: list[Path], configs: list[RunConfig], like: TrainState) -> Restored:
-    """The last checkpoint that is whole in every member's folder; `like`: shapes and types of all their states.
+def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainState) -> Restored:
+    """The last checkpoint that is valid in every member's folder; `target`: shapes and types of all their states.
 
-    What is damaged is set aside; what is later, or was never finished, goes: it will be made again, the same.
-    Raises checkpoint.Foreign, with nothing touched, where what was saved is of something else.
+    Corrupt checkpoints are quarantined; later or unfinished ones are deleted: the run makes them again. Raises Foreign,
+    with nothing touched, where a checkpoint belongs to another run or version.
     """
-    one, notes = _one(like), []
+    one, notes = _one(target), []
     common = set.intersection(*[set(checkpoint.steps(folder)) for folder in folders])
     for env_steps in sorted(common, reverse=True):
         try:
@@ -50,41 +50,31 @@ def latest(folders: list[Path], configs: list[RunConfig], like: TrainState) -> R
         env_steps, found = 0, []
     for folder in folders:
         checkpoint.clear_after(folder, env_steps)
-    whence = f"going on from the checkpoint at step {env_steps:,}" if env_steps else "starting afresh: none is whole"
-    notes = [f"{note}; {whence}" for note in notes]
+    where = f"resuming from step {env_steps:,}" if env_steps else "no valid checkpoint; starting from scratch"
+    notes = [f"{note}; {where}" for note in notes]
     states = stack([each.state for each in found]) if found else None
     return Restored(env_steps, states, [each.record for each in found], notes)
 
 
-def learner_shapes(learner: Learner) -> LearnerState:
-    """Shapes and types of one member's learner, for which no environment is traced."""
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), jax.eval_shape(learner.init, jax.random.PRNGKey(0))
-    )
+def abstract_learner(spec: LearnerSpec) -> LearnerState:
+    """Shapes and types of one member's learner; no environment is traced."""
+    state = jax.eval_shape(lambda key: learner.init(spec, spec.config.hyperparameters, key), jax.random.PRNGKey(0))
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
 
 
-def last(env: Env, run: RunConfig, folder: Path) -> tuple[Trainer, LearnerState, int]:
-    """Trainer, learner (leading axis: one member) and environment steps of a seed's last checkpoint.
+def iter_learners(spec: LearnerSpec, run: RunConfig, folder: Path, most: int) -> Iterator[tuple[LearnerState, int]]:
+    """Learner (leading axis: one member) and environment steps of a seed's last `most` checkpoints, newest first.
 
-    Raises FileNotFoundError, naming the folder, where there is none; OSError where it is not whole: whoever flies a
-    policy should not be given an earlier one unasked.
-    """
-    trainer = Trainer(env, run.learner)
-    return trainer, *next(newest(trainer.learner, run, folder, 1))
-
-
-def newest(learner: Learner, run: RunConfig, folder: Path, most: int) -> Iterator[tuple[LearnerState, int]]:
-    """Learner and environment steps, as from `last`, of a seed's checkpoints, newest first, of at most so many.
-
-    Each is read when it is asked for, and raises as `last` does.
+    Each is read when it is asked for. Raises FileNotFoundError, naming the folder, where there is none; OSError where
+    one is corrupt, rather than giving an earlier one.
     """
     saved = checkpoint.steps(folder)
     if not saved:
         raise FileNotFoundError(f"{folder}: no checkpoint")
     nothing: Any = [None] * len(TrainState._fields)
-    like = TrainState(*nothing)._replace(learner=learner_shapes(learner))
+    target = TrainState(*nothing)._replace(learner=abstract_learner(spec))
     for env_steps in saved[:most]:
-        found = checkpoint.read(folder, run, env_steps, like, part=True)
+        found = checkpoint.read(folder, run, env_steps, target, part=True)
         yield jax.tree.map(jnp.array, stack([found.state.learner])), found.env_steps
 
 

@@ -1,7 +1,4 @@
-"""What a run is: its state, the point that it trains at, and how members of these lie side by side and on devices.
-
-Shapes are one member's (one seed or grid point); whoever trains has a leading member axis before them.
-"""
+"""The state of a run, and the inputs of its program. Shapes are one member's (one seed or grid point)."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -10,13 +7,14 @@ import chex
 import jax
 import numpy as np
 
-from qrl.algorithm.learner import Hyper, LearnerState, Terms, hyper
-from qrl.algorithm.replay_buffer import Ring
+from qrl.algorithm.adapter import adapt
+from qrl.algorithm.learner import LearnerState, UpdateMetrics
+from qrl.algorithm.replay_buffer import ReplayBuffer
 from qrl.algorithm.rollout import Lanes
 from qrl.algorithm.types import Env
-from qrl.config import Config
+from qrl.config import Config, Hyperparameters
 
-FAULT_TERMS = ("reward", "observation", *Terms._fields)
+FAULT_TERMS = ("reward", "observation", *UpdateMetrics._fields)
 
 
 class Totals(NamedTuple):
@@ -25,37 +23,37 @@ class Totals(NamedTuple):
     rewards: chex.Array
     steps: chex.Array
     episodes: chex.Array  # that ended
-    early: chex.Array  # of these, before their last step (fled, tumbled, or terminated)
+    early: chex.Array  # of these, before their last step
     updates: chex.Array
-    terms: Terms
+    metrics: UpdateMetrics
 
 
 class TrainState(NamedTuple):
-    """Everything a run needs to go on: what a checkpoint holds."""
+    """All that a run needs to continue; the content of a checkpoint."""
 
     learner: LearnerState
-    ring: Ring
+    buffer: ReplayBuffer
     lanes: Lanes
     key: chex.PRNGKey  # of noise and minibatches
-    starts: chex.PRNGKey  # of the lanes' starts
+    start_key: chex.PRNGKey  # of the lanes' starts
     unrolls: chex.Array  # int32 []
     fault_update: chex.Array  # int32 []: the update in which a number was first not finite; −1: none
-    fault_term: chex.Array  # int32 []: which (FAULT_TERMS)
-    totals: Totals  # since the last report; whoever reports sets them to zero
+    fault_term: chex.Array  # int32 []: its index in FAULT_TERMS
+    totals: Totals  # since the last report, which resets them
 
 
-class Point(NamedTuple):
-    """What one program takes as arguments: members may differ in it, and in nothing else but their seed."""
+class MemberInputs(NamedTuple):
+    """Arguments of the program: members may differ in these and in their seed, and in nothing else."""
 
-    hyper: Hyper
-    world: Any  # the environment's `params`; () of one that has none
+    hyper: Hyperparameters
+    env_params: Any  # the environment's `params`; () for one without
 
 
-def point(env: Env, config: Config) -> Point:
-    """The point (NumPy, one member's) of an environment and a configuration."""
-    return Point(hyper(config), jax.tree.map(np.asarray, getattr(env, "params", ())))
+def member_inputs(env: Env, config: Config) -> MemberInputs:
+    """One member's inputs (NumPy) for an environment and a configuration."""
+    return MemberInputs(config.hyperparameters, jax.tree.map(np.asarray, adapt(env).params))
 
 
 def stack(members: Sequence[Any]) -> Any:
-    """Members' values side by side: a leading member axis."""
+    """Members' values with a leading member axis."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *members)

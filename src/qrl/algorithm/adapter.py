@@ -1,0 +1,54 @@
+"""Any Brax environment as a `TaskEnv`: defaults for the abilities that it does not offer."""
+
+from typing import Any
+
+import chex
+
+from qrl.algorithm.types import Env, Evaluation, State, Symmetry, TaskEnv
+
+BRAX_EPISODE_STEPS = 1000  # Brax's customary episode length
+
+_ABILITIES = (
+    *("params", "episode_steps", "control_period_s", "differentiable"),
+    *("with_params", "restart", "reset_calibration", "symmetry", "evaluation"),
+)
+
+
+class _Adapted:
+    """Defaults of a `TaskEnv`; an attribute that the wrapped environment has takes precedence."""
+
+    def __init__(self, env: Env) -> None:
+        self.unwrapped_env = env
+        period = getattr(env, "dt", None)  # Brax's name
+        self.control_period_s: float | None = None if period is None else float(period)
+        for name in ("reset", "step", "observation_size", "action_size", *_ABILITIES):
+            if hasattr(env, name):
+                setattr(self, name, getattr(env, name))
+
+    params: Any = ()
+    episode_steps: int = BRAX_EPISODE_STEPS
+    differentiable: bool = False  # not known
+
+    def with_params(self, params: Any) -> Any:
+        del params
+        return self
+
+    def restart(self, state: Any, rng: chex.PRNGKey) -> State:
+        del state
+        return self.unwrapped_env.reset(rng)
+
+    def reset_calibration(self, rng: chex.PRNGKey) -> State:
+        return self.unwrapped_env.reset(rng)
+
+    def symmetry(self, u: chex.Array) -> Symmetry | None:
+        del u
+        return None
+
+    def evaluation(self) -> Evaluation | None:
+        return None
+
+
+def adapt(env: Env) -> TaskEnv:
+    """`env` itself where it offers every ability of a `TaskEnv`, else a view of it with defaults for the others."""
+    task_env: Any = env if all(hasattr(env, name) for name in _ABILITIES) else _Adapted(env)
+    return task_env

@@ -1,0 +1,33 @@
+"""The learner's pure functions with their spec and hyperparameters bound, as a test of one learner calls them."""
+
+from functools import partial
+from typing import Any
+
+from qrl.algorithm import analytic_gradient, learner
+from qrl.algorithm.learner import LearnerSpec
+from qrl.config import Config, Hyperparameters
+
+
+class BoundLearner:
+    def __init__(self, config: Config, observation_size: int, action_size: int, axis: str | None = None) -> None:
+        self.config = config
+        self.spec = LearnerSpec(config, observation_size, action_size, axis)
+        self.total_updates = self.spec.total_updates
+        self.policy, self.critic = self.spec.policy, self.spec.critic
+        self._bind(config.hyperparameters)
+
+    def with_hyper(self, hyper: Hyperparameters) -> "BoundLearner":
+        other = BoundLearner(*self.spec)
+        other._bind(hyper)
+        return other
+
+    def _bind(self, hyper: Hyperparameters) -> None:
+        def bound(function: Any) -> Any:
+            return partial(function, self.spec, hyper)
+
+        self.hyper = hyper
+        self.init, self.update, self.loss = bound(learner.init), bound(learner.update), bound(learner._loss)
+        self.mean, self.sigma, self.preprocess = map(bound, (learner.policy_mean, learner.sigma, learner.preprocess))
+        self.deployed = partial(learner.deployed, self.spec)
+        self.update_statistics = partial(learner.update_statistics, self.spec)
+        self.apg_update = bound(analytic_gradient.update)
