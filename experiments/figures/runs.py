@@ -197,7 +197,7 @@ def environment() -> dict[str, str]:
 def rows(folder: Path) -> list[Rows]:
     """metrics.csv of each seed."""
     config = tasks.load_run_config(folder)
-    found = [files.read_metrics(member) for member in record.members(folder, config)]
+    found = [files.read_metrics(member) for member in record.member_folders(folder, config)]
     return [[dict(row) for row in one] for one in found]
 
 

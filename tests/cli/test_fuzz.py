@@ -90,7 +90,7 @@ def has_folders(run: RunConfig) -> None:
     """Of a number that a disk holds, inside runs/; and seeds that the program's integers hold."""
     if run.seeds > 100_000:
         raise MemoryError(run.seeds)
-    folders = record.members(Path("runs") / run.task.name, run)
+    folders = record.member_folders(Path("runs") / run.task.name, run)
     assert Path("runs").resolve() in folders[0].resolve().parents
     assert run.member(run.seeds - 1).seed < 2**31
 

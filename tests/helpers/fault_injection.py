@@ -20,7 +20,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from qrl.runs import checkpoint
-from qrl.runs.integrity import NAME
+from qrl.runs.integrity import MANIFEST
 
 TORTURE = os.environ.get("QRL_TORTURE") == "1"  # all of it, not a sample
 PATIENCE = 400.0  # seconds: whatever takes longer hangs
@@ -98,9 +98,9 @@ def metrics(folder: Path) -> list[dict[str, str]]:
 
 def leaves(folder: Path, env_steps: int | None = None) -> dict[str, np.ndarray]:
     """Every leaf of a checkpoint, the last where nothing is said, read by Orbax alone."""
-    path = folder / "checkpoints" / str(env_steps or checkpoint.steps(folder)[0]) / checkpoint.STATE
-    with ocp.StandardCheckpointer() as orbax:
-        return {name: np.asarray(leaf) for name, leaf in orbax.restore(path.resolve()).items()}
+    path = folder / "checkpoints" / str(env_steps or checkpoint.saved_steps(folder)[0]) / checkpoint.STATE
+    with checkpoint.plain_path(path) as plain, ocp.StandardCheckpointer() as orbax:
+        return {name: np.asarray(leaf) for name, leaf in orbax.restore(plain).items()}
 
 
 def assert_same_leaves(found: dict[str, np.ndarray], wanted: dict[str, np.ndarray]) -> None:
@@ -113,7 +113,7 @@ def assert_same_leaves(found: dict[str, np.ndarray], wanted: dict[str, np.ndarra
 def assert_same_run(folder: Path, whole: Path) -> None:
     """No update is lost: every number is that of a run never stopped, bit for bit, clocks aside; nothing lies about."""
     assert metrics(folder) == metrics(whole)
-    assert checkpoint.steps(folder)[0] == checkpoint.steps(whole)[0]
+    assert checkpoint.saved_steps(folder)[0] == checkpoint.saved_steps(whole)[0]
     assert_same_leaves(leaves(folder), leaves(whole))
     assert not [*folder.rglob("*.tmp"), *folder.rglob("*orbax-checkpoint-tmp*")]
 
@@ -141,7 +141,7 @@ _whole: list[Path] = []
 def unfinished(whole: Path, to: Path, env_steps: int) -> Path:
     """A copy of a run as it was when it had come so far."""
     shutil.copytree(whole, to)
-    checkpoint.clear_after(to, env_steps)
+    checkpoint.discard_after(to, env_steps)
     for name in ("summary.json", "learning_curve.png", "flight.png"):
         (to / name).unlink(missing_ok=True)
     return to
@@ -177,17 +177,17 @@ def killed_again_and_again(
     """
     happened, span = 0, seconds
     while happened < kills:
-        before = [checkpoint.steps(folder)[:1] for folder in folders]
+        before = [checkpoint.saved_steps(folder)[:1] for folder in folders]
         reached = max((steps[0] for steps in before if steps), default=0)
         process = start(*words, **changes)
         if happened == kills - 1:
-            wait_for(process, lambda: (folders[0] / "checkpoints" / str(whole_steps) / NAME).exists())
+            wait_for(process, lambda: (folders[0] / "checkpoints" / str(whole_steps) / MANIFEST).exists())
             wait_for(process, lambda: False, draw.uniform(0.0, 0.5))
         else:
             ahead = reached / whole_steps > (happened + 1) / kills
             moment = PATIENCE if happened == 1 else draw.uniform(0.0, seconds / 4 if ahead else span)
             goal = reached + (whole_steps - reached) // (kills - happened + 1)
-            wait_for(process, lambda goal=goal: checkpoint.steps(folders[0])[:1] > [goal], moment)
+            wait_for(process, lambda goal=goal: checkpoint.saved_steps(folders[0])[:1] > [goal], moment)
             wait_for(process, lambda: False, draw.uniform(0.0, 0.2))
         which = SIGNALS[happened % len(SIGNALS)]
         if process.poll() is None:
@@ -199,7 +199,7 @@ def killed_again_and_again(
         happened += 1
         assert ended.code in (1, -which), (which, ended)
         assert "Traceback" not in ended.error, ended.error
-        after = [checkpoint.steps(folder)[:1] for folder in folders]
+        after = [checkpoint.saved_steps(folder)[:1] for folder in folders]
         assert all(now >= earlier for now, earlier in zip(after, before, strict=True)), "a checkpoint is lost"
         if after == before:
             span *= 1.1

@@ -37,7 +37,7 @@ def train(
     out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_after: int | None = None
 ) -> list[loop.Event]:
     """Run to the end, or until `stop_after` events beyond compilation."""
-    for folder in record.members(out, run):
+    for folder in record.member_folders(out, run):
         folder.mkdir(parents=True, exist_ok=True)
     seen: list[loop.Event] = []
 

@@ -66,7 +66,7 @@ def test_a_restored_state_runs_the_program_of_a_first_one(task: str) -> None:
 def test_rows_after_the_checkpoint_are_cut(tmp_path: Path, pendulum: Env, whole: Path) -> None:
     """Killed before the last checkpoint was made: its row is made again, once, and the run then ends."""
     train(tmp_path, run_config(), pendulum)
-    checkpoint.clear_after(tmp_path, 1000)
+    checkpoint.discard_after(tmp_path, 1000)
     train(tmp_path, run_config(), pendulum, resume=True)
     assert comparable_metrics(tmp_path) == comparable_metrics(whole)
 

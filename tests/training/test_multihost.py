@@ -13,7 +13,7 @@ import pytest
 import fault_injection
 from fault_injection import TORTURE
 from qrl.runs import checkpoint
-from qrl.runs.integrity import FORMAT, NAME
+from qrl.runs.integrity import FORMAT, MANIFEST
 
 SURVIVOR_SECONDS = 60.0  # in which the other has to end
 STEPS = 32_000
@@ -59,7 +59,7 @@ def test_killed_pair_goes_on(request: pytest.FixtureRequest, tmp_path: Path, who
     """Killed between two checkpoints: the other ends by itself; started again, both end as if never killed."""
     run = tmp_path / "run"
     processes = pair(*TRAIN, "--out", run)
-    there = fault_injection.wait_for(processes[0], lambda: sealed(run) > 1)
+    there = fault_injection.wait_for(processes[0], lambda: complete(run) > 1)
     assert there, [fault_injection.end(process) for process in processes]
     time.sleep(random.Random(request.node.name).uniform(0.0, 0.2))
     processes[killed].send_signal(signal.SIGKILL)
@@ -82,16 +82,16 @@ def test_killed_pair_goes_on(request: pytest.FixtureRequest, tmp_path: Path, who
     )
 
 
-def sealed(run: Path) -> int:
-    return len(checkpoint.steps(run)) if (run / "checkpoints").is_dir() else 0
+def complete(run: Path) -> int:
+    return len(checkpoint.saved_steps(run)) if (run / "checkpoints").is_dir() else 0
 
 
 @pytest.mark.skipif(not TORTURE, reason="part of make torture")
 def test_a_refused_checkpoint_leaves_nobody_waiting(tmp_path: Path, whole: Path) -> None:
     """Found when all are at work: the first says why, and both end."""
     run = fault_injection.unfinished(whole, tmp_path / "run", STEPS // 2)
-    seal = run / "checkpoints" / str(checkpoint.steps(run)[0]) / NAME
-    seal.write_text(seal.read_text().replace(f'"format":{FORMAT}', f'"format":{FORMAT + 1}'))
+    manifest = run / "checkpoints" / str(checkpoint.saved_steps(run)[0]) / MANIFEST
+    manifest.write_text(manifest.read_text().replace(f'"format": {FORMAT},', f'"format": {FORMAT + 1},'))
     first, second = (fault_injection.end(p, SURVIVOR_SECONDS) for p in pair(*TRAIN, "--out", run, "--resume"))
     assert first.code == 2
     assert "later version of qrl" in first.error

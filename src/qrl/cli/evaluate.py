@@ -66,7 +66,7 @@ def evaluate(args: argparse.Namespace) -> int:
         results = [_evaluated(run, i, args.checkpoints, task) for i in range(config.seeds)]
         flown = _flown(baselines, others)
     table = [{**result, **_beside(flown)} for result, _ in results]
-    for folder, result, (_, flights) in zip(record.members(args.run, config), table, results, strict=True):
+    for folder, result, (_, flights) in zip(record.member_folders(args.run, config), table, results, strict=True):
         files.write_json(folder / "evaluation.json", result)
         if task:
             _draw(folder, task, flights, flown)
@@ -97,8 +97,8 @@ def _of_same_task(folder: Path, run: Path, config: RunConfig) -> RunConfig:
             f"{folder}: --beside: expected a run of the same task as {run}, '{config.task.name}', found one of"
             f" '{other.task.name}'{' that differs' if other.task.name == config.task.name else ''}"
         )
-    for member in record.members(folder, other):
-        if not checkpoint.steps(member):
+    for member in record.member_folders(folder, other):
+        if not checkpoint.saved_steps(member):
             raise BadInput(f"{member}: --beside: no checkpoint")
     return other
 
@@ -111,7 +111,7 @@ def _judged(config: RunConfig) -> dict[str, Any]:
 
 def _saved(run: Run, seed: int, most: int) -> Iterator[tuple[LearnerState, int]]:
     """Learner and environment steps of a seed's checkpoints, newest first."""
-    folder = record.members(run.folder, run.config)[seed]
+    folder = record.member_folders(run.folder, run.config)[seed]
     try:
         yield from restore.iter_learners(run.policies.trainer.setup.spec, run.config.member(seed), folder, most)
     except OSError as error:
@@ -145,7 +145,7 @@ def _flown(baselines: Baselines | None, others: list[Run]) -> Flown:
         if there:
             flown.baselines[name]["off_nominal"] = {world: summarize(flights) for world, flights in there.items()}
     for run in others:
-        for i, folder in enumerate(record.members(run.folder, run.config)):
+        for i, folder in enumerate(record.member_folders(run.folder, run.config)):
             result, flown.flights[str(folder)] = _evaluated(run, i, 1, None)
             flown.beside[str(folder)] = result
     return flown

@@ -175,7 +175,7 @@ def _run(args: argparse.Namespace) -> int:
 
     from qrl.export.kernel import PossibleOverflow
     from qrl.export.targets import ProofFailed
-    from qrl.runs.integrity import Foreign
+    from qrl.runs.integrity import IncompatibleCheckpoint
     from qrl.training.driver import NotFinite
     from qrl_envs.specfile import BadInput
 
@@ -185,7 +185,7 @@ def _run(args: argparse.Namespace) -> int:
     except BadInput as error:  # every process hears of it
         complain(str(error))
         return WRONG_INPUT
-    except Foreign as error:
+    except IncompatibleCheckpoint as error:
         complain(str(error))
         code = WRONG_INPUT
     except (NotFinite, PossibleOverflow, ProofFailed) as error:

@@ -137,14 +137,14 @@ def _value(text: str) -> Any:
 
 
 def _prepare(out: Path, config: RunConfig, held: bool) -> None:
-    for i, folder in enumerate(record.members(out, config)):
+    for i, folder in enumerate(record.member_folders(out, config)):
         folder.mkdir(parents=True, exist_ok=True)
         if held:
-            files.tidy(folder)
+            files.remove_leftovers(folder)
         else:
             files.write_json(folder / "config.json", config.member(i).model_dump(mode="json"))
     if held:
-        files.tidy(out)
+        files.remove_leftovers(out)
     else:
         files.write_json(out / "config.json", config.model_dump(mode="json"))
 
@@ -203,7 +203,7 @@ def _finish(out: Path, config: RunConfig, finished: loop.Finished, seconds: floa
     from qrl.runs import learning_curve
     from qrl_envs.plots import flights
 
-    folders = record.members(out, config)
+    folders = record.member_folders(out, config)
     history = finished.rows
     for i, folder in enumerate(folders):
         title = f"{config.task.name}, seed {config.seed + i}"

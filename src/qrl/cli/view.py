@@ -31,7 +31,7 @@ def view(args: argparse.Namespace) -> int:
     config = tasks.load_run_config(args.run)
     if not config.task.spec:
         raise BadInput(f"{args.run}: expected a run of one of our own tasks, found Brax's '{config.task.name}'")
-    folders = record.members(args.run, config)
+    folders = record.member_folders(args.run, config)
     if args.out and len(folders) > 1:
         raise BadInput(f"{args.run}: --out: holds {config.seeds} seeds; name one of them, such as {folders[0]}")
     asked = _asked(args.starts) if args.starts else None

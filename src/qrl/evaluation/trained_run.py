@@ -54,7 +54,7 @@ class Run:
         self.folder = folder
         self.config = tasks.load_run_config(folder)
         if self.config.seeds > 1:
-            one = record.members(folder, self.config)[0]
+            one = record.member_folders(folder, self.config)[0]
             raise BadInput(f"{folder}: holds {self.config.seeds} seeds; name one of them, such as RUN={one}")
         self.env: Env = tasks.environment(self.config.task)
         try:

@@ -1,1 +1,1 @@
-"""The run folder: what is written, and what is read back."""
+"""The run folder: config.json, metrics, checkpoints, TensorBoard events and plots."""

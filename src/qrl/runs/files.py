@@ -6,6 +6,7 @@ import io
 import json
 import math
 import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,19 +16,19 @@ from qrl_envs.specfile import BadInput
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Write `data` whole or not at all."""
+    """Write `data` atomically; numbers that are not finite become null."""
     replace_text(path, json.dumps(_plain(data), indent=2) + "\n")
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file under another name and rename it: whoever reads sees the old one or the new one, whole."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # nobody else's, should two write the same file
+    """Write a file atomically: to a temporary name, then renamed. OSError names `path`."""
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # one for each process
     with writing(path):
         try:
             with temporary.open("w", encoding="utf-8") as file:
                 file.write(text)
                 file.flush()
-                os.fsync(file.fileno())  # a name that outlives a crash must not point at what did not
+                os.fsync(file.fileno())  # before the name: after a crash it must not point to missing data
             temporary.replace(path)
         except OSError:
             temporary.unlink(missing_ok=True)
@@ -36,22 +37,21 @@ def replace_text(path: Path, text: str) -> None:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """While `path` is written: an OSError's message names it, whatever the system calls it."""
+    """Name `path` in the message of an OSError that is raised while it is written."""
     try:
         yield
     except OSError as error:
         raise OSError(f"{path}: cannot be written ({error.strerror or error})") from None
 
 
-def tidy(folder: Path) -> None:
-    """Remove what a killed process left of files that it was writing; for who alone writes in this run folder."""
+def remove_leftovers(folder: Path) -> None:
+    """Remove the temporary files of a process that was killed. The caller must hold the lock of the run folder."""
     for name in ("config.json", "metrics.csv", "summary.json", "evaluation.json"):
         for temporary in folder.glob(f"{name}.*.tmp"):
             temporary.unlink(missing_ok=True)
 
 
 def _plain(data: Any) -> Any:
-    """JSON has no infinities: a number that is not finite becomes null."""
     if isinstance(data, dict):
         return {key: _plain(value) for key, value in data.items()}
     if isinstance(data, list | tuple):
@@ -59,14 +59,13 @@ def _plain(data: Any) -> Any:
     return None if isinstance(data, float) and not math.isfinite(data) else data
 
 
-Row = dict[str, float | int]
+Row = dict[str, float | int]  # of metrics.csv
 
-
-REPORTED = ("env_steps", "updates", "return_mean", "return_min", "success", "train_seconds")  # by every run
+REPORTED = ("env_steps", "updates", "return_mean", "return_min", "success", "train_seconds")  # columns of every run
 
 
 def read_metrics(folder: Path) -> list[Row]:
-    """The rows of metrics.csv; an empty cell (not measured) is NaN. OSError, naming the file, if it is damaged."""
+    """The rows of metrics.csv; an empty cell (not measured) is NaN. OSError, naming the file, if it is corrupt."""
     path = folder / "metrics.csv"
     if not path.exists():
         return []
@@ -88,13 +87,13 @@ def _number(cell: str) -> float | int:
     return int(number) if abs(number) < 2**53 and cell.lstrip("-").isdigit() else number
 
 
-def comparable(value: float) -> float:
-    """For rankings: what was not measured, or is no number, is the worst."""
+def rank_key(value: float) -> float:
+    """`value` as a sort key; NaN (not measured) ranks last."""
     return -math.inf if math.isnan(value) else value
 
 
 def write_metrics(folder: Path, rows: list[Row]) -> None:
-    """Write metrics.csv anew: a few dozen rows, and so it is never half-written. Without a row there is none."""
+    """Replace metrics.csv atomically; without rows, remove it."""
     if not rows:
         (folder / "metrics.csv").unlink(missing_ok=True)
         return
@@ -102,7 +101,7 @@ def write_metrics(folder: Path, rows: list[Row]) -> None:
 
 
 def csv_text(rows: list[dict[str, Any]]) -> str:
-    """Rows as CSV, the same columns in each; NaN (not measured) is an empty cell."""
+    """Rows as CSV, with the columns of all rows; NaN (not measured) is an empty cell."""
     text = io.StringIO()
     names = dict.fromkeys(name for row in rows for name in row)
     writer = csv.DictWriter(text, fieldnames=list(names), lineterminator="\n")
@@ -116,12 +115,19 @@ def csv_text(rows: list[dict[str, Any]]) -> str:
 
 @contextmanager
 def locked(path: Path, busy: str) -> Iterator[None]:
-    """Hold the lock file at `path`; BadInput, saying `busy`, if another process does. It goes when its process does."""
+    """Hold the lock file at `path`, at most until the process ends; BadInput(busy) if another process holds it.
+
+    On a file system without locks, print a warning and continue.
+    """
     with path.open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise BadInput(busy) from None
-        except OSError:
-            pass  # a file system without locks
+        except OSError as error:
+            print(
+                f"qrl: warning: {path}: the file system cannot lock ({error.strerror}):"
+                " do not start a second process on this folder",
+                file=sys.stderr,
+            )
         yield

@@ -1,112 +1,91 @@
-"""The seal of a checkpoint: a file, written last, with the SHA-256 of every other and of the run whose it is."""
+"""The manifest of a checkpoint: the SHA-256 of every file, written last."""
 
 import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from qrl.runs.files import replace_text
 
-from qrl.runs.files import Row, replace_text
-
-NAME = "seal.json"
-FORMAT: Literal[2] = 2
+MANIFEST = "manifest.json"
+FORMAT = 3
+_FORMER_MANIFEST = "seal.json"  # of formats 1 and 2
 
 
-class Record(BaseModel):
-    """What a checkpoint holds besides the training state."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
-
-    rows: list[Row]  # of metrics.csv, up to here
-    train_seconds: float
-    report_seconds: float  # of these, since the last report
+class CorruptCheckpoint(OSError):
+    """A file of a checkpoint is not as it was written; the message names both."""
 
 
-class Seal(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=True, ser_json_inf_nan="constants")
-
-    format: Literal[2] = FORMAT
-    run_sha256: str  # whose it is
-    record: Record
-    record_sha256: str
-    sha256: dict[str, str]  # of each file, by its path in the checkpoint
+class IncompatibleCheckpoint(OSError):
+    """A checkpoint of another run, or of another version of qrl."""
 
 
-class Damaged(OSError):
-    """A checkpoint is not what was written; the message says which file of which."""
+def write_manifest(path: Path) -> None:
+    """Complete the checkpoint at `path`; every file is on disk before its manifest is."""
+    digests = {name: _sha256(path / name, sync=True) for name in _files(path)}
+    for folder in (path, *(inside for inside in path.rglob("*") if inside.is_dir())):
+        _sync(folder)
+    replace_text(path / MANIFEST, json.dumps({"format": FORMAT, "sha256": digests}) + "\n")
 
 
-class Foreign(OSError):
-    """A checkpoint is whole, and not one of this run, or of another version of qrl."""
+def has_manifest(path: Path) -> bool:
+    """Whether the checkpoint at `path` was completed, by this version of qrl or another."""
+    return (path / MANIFEST).exists() or (path / _FORMER_MANIFEST).exists()
 
 
-def close(path: Path, run_sha256: str, record: Record) -> None:
-    """Seal the checkpoint at `path`, once all that it vouches for is on disk."""
-    seal = Seal(
-        run_sha256=run_sha256,
-        record=record,
-        record_sha256=_record_sha256(record),
-        sha256={name: _sha256(path / name, on_disk=True) for name in _files(path)},
-    )
-    for inside in (path, *(place for place in path.rglob("*") if place.is_dir())):
-        _sync(inside)
-    replace_text(path / NAME, seal.model_dump_json() + "\n")
+def remove_manifest(path: Path) -> None:
+    for name in (MANIFEST, _FORMER_MANIFEST):
+        (path / name).unlink(missing_ok=True)
 
 
-def checked(path: Path) -> Seal:
-    """The seal of a checkpoint whose every file is as it was sealed; Damaged, or Foreign, if one is not."""
+def verify(path: Path) -> None:
+    """Raise CorruptCheckpoint if a file differs from its digest, IncompatibleCheckpoint if the format is not FORMAT."""
+    manifest = path / MANIFEST
+    if not manifest.exists() and (path / _FORMER_MANIFEST).exists():
+        raise IncompatibleCheckpoint(f"{path}: written by an earlier version of qrl, which this one cannot resume")
     try:
-        text = (path / NAME).read_bytes()
-        version = json.loads(text)
+        data = json.loads(manifest.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise Damaged(f"{path}/{NAME}: cannot be read ({first_line(error)})") from None
-    if isinstance(version, dict) and isinstance(found := version.get("format"), int) and found != FORMAT:
-        when = "a later" if found > FORMAT else "an earlier"
-        raise Foreign(f"{path}: of {when} version of qrl (format {str(found)[:20]}; this one reads {FORMAT})")
-    try:
-        seal = Seal.model_validate_json(text)
-    except ValidationError as error:
-        raise Damaged(f"{path}/{NAME}: is damaged ({error.errors()[0]['msg']})") from None
-    if _record_sha256(seal.record) != seal.record_sha256:
-        raise Damaged(f"{path}/{NAME}: is damaged")
-    found = set(_files(path))
-    for name, digest in seal.sha256.items():
-        if name not in found:
-            raise Damaged(f"{path}: {json.dumps(name)[:120]} is missing")
+        raise CorruptCheckpoint(f"{manifest}: cannot be read ({first_line(error)})") from None
+    version, digests = (data.get("format"), data.get("sha256")) if isinstance(data, dict) else (None, None)
+    if isinstance(version, int) and version != FORMAT:
+        when = "a later" if version > FORMAT else "an earlier"
+        raise IncompatibleCheckpoint(
+            f"{path}: written by {when} version of qrl (format {str(version)[:20]}; this one reads {FORMAT})"
+        )
+    if version != FORMAT or not isinstance(digests, dict):
+        raise CorruptCheckpoint(f"{manifest}: is corrupt")
+    present = set(_files(path))
+    for name, digest in digests.items():
+        if name not in present:
+            raise CorruptCheckpoint(f"{path}: {json.dumps(name)[:120]} is missing")
         try:
-            same = _sha256(path / name) == digest
+            actual = _sha256(path / name)
         except OSError as error:
-            raise Damaged(f"{path}/{name}: cannot be read ({first_line(error)})") from None
-        if not same:
-            raise Damaged(f"{path}/{name}: is damaged")
-    return seal
-
-
-def _files(path: Path) -> list[str]:
-    return sorted(str(f.relative_to(path)) for f in path.rglob("*") if f.is_file() and f.name != NAME)
-
-
-def _sha256(path: Path, *, on_disk: bool = False) -> str:
-    with path.open("rb") as file:
-        if on_disk:  # a seal that outlives a crash must not vouch for what did not; Orbax leaves it to the system
-            os.fsync(file.fileno())
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _sync(folder: Path) -> None:
-    at = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(at)
-    finally:
-        os.close(at)
-
-
-def _record_sha256(record: Record) -> str:
-    return hashlib.sha256(record.model_dump_json().encode()).hexdigest()
+            raise CorruptCheckpoint(f"{path}/{name}: cannot be read ({first_line(error)})") from None
+        if actual != digest:
+            raise CorruptCheckpoint(f"{path}/{name}: is corrupt")
 
 
 def first_line(error: Exception) -> str:
     text = (isinstance(error, OSError) and error.strerror) or str(error).strip()
     return text.split("\n")[0][:120]
+
+
+def _files(path: Path) -> list[str]:
+    return sorted(str(file.relative_to(path)) for file in path.rglob("*") if file.is_file() and file.name != MANIFEST)
+
+
+def _sha256(path: Path, *, sync: bool = False) -> str:
+    with path.open("rb") as file:
+        if sync:  # Orbax leaves it to the system
+            os.fsync(file.fileno())
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _sync(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

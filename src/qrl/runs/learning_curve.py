@@ -1,4 +1,4 @@
-"""The learning curve of a run, or of several seeds of it, as PNG; of matplotlib's objects alone, without pyplot."""
+"""The learning curve of one or several seeds, as PNG; drawn without pyplot, which is slow to import."""
 
 from pathlib import Path
 
@@ -8,9 +8,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-Rows = list[dict[str, float | str]]  # of metrics.csv: column -> number, as such or as text; "" where there is none
+Rows = list[dict[str, float | str]]  # of metrics.csv: column -> number, or its text; "" if not measured
 
-BLUE, GREEN, INK = "#0072B2", "#009E73", "#333333"  # of Okabe and Ito's colours, for any eye
+BLUE, GREEN, INK = "#0072B2", "#009E73", "#333333"  # Okabe and Ito's palette for color blindness
 PIXELS_PER_INCH = 150
 
 
@@ -20,7 +20,7 @@ def learning_curve(path: Path, runs: list[Rows], title: str) -> None:
 
 
 def learning_curve_figure(runs: list[Rows], title: str) -> Figure:
-    """What `learning_curve` saves. Axes: the return and, where any row has one, the success."""
+    """The figure of `learning_curve`. Axes: the return and, if any row has it, the success."""
     steps, success = aligned(runs, "success")
     has_success = bool(np.isfinite(success).any())
     figure = Figure(figsize=(8.0, 5.4 if has_success else 3.6), dpi=PIXELS_PER_INCH, layout="constrained")
@@ -42,9 +42,9 @@ def learning_curve_figure(runs: list[Rows], title: str) -> Figure:
 
 
 def aligned(runs: list[Rows], key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Every number of environment steps in `runs`, [x], and their columns `key` there, [runs, x].
+    """The union of environment steps of `runs`, [x], and column `key` of each run at these steps, [runs, x].
 
-    A run without a number there is interpolated; before its first number and after its last it is NaN.
+    Values between the rows of a run are interpolated; before its first finite value and after its last they are NaN.
     """
     tables = [np.array([(number(row, "env_steps"), number(row, key)) for row in rows]).reshape(-1, 2) for rows in runs]
     steps = np.unique(np.concatenate([np.empty((0, 2)), *tables])[:, 0])
@@ -58,29 +58,29 @@ def aligned(runs: list[Rows], key: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def number(row: dict[str, float | str], key: str) -> float:
-    """A cell of metrics.csv; NaN where it is absent, empty or no number."""
+    """A cell of metrics.csv; NaN if it is absent, empty or no number."""
     try:
         return float(row.get(key, "nan"))
     except ValueError:
         return float("nan")
 
 
-def spread(values: np.ndarray) -> np.ndarray:
-    """(least, median, most) of the finite among `values` [runs, x] at each x: [3, x]; NaN where there are none."""
-    found = np.full((3, values.shape[1]), np.nan)
-    seen = np.isfinite(values).any(axis=0)
-    found[:, seen] = np.nanquantile(values[:, seen], [0.0, 0.5, 1.0], axis=0)
-    return found
+def _min_median_max(values: np.ndarray) -> np.ndarray:
+    """(minimum, median, maximum) over the finite of `values` [runs, x] at each x: [3, x]; NaN if none is finite."""
+    quantiles = np.full((3, values.shape[1]), np.nan)
+    finite = np.isfinite(values).any(axis=0)
+    quantiles[:, finite] = np.nanquantile(values[:, finite], [0.0, 0.5, 1.0], axis=0)
+    return quantiles
 
 
-def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, label: str = "") -> None:
-    """One run's line; of several their median, and a band from the least to the most; `values` [runs, x]."""
-    low, median, high = spread(values)
+def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, label: str = "") -> None:
+    """Draw one run as a line, several as their median and a band of their range; `values` [runs, x]."""
+    low, median, high = _min_median_max(values)
     if len(values) > 1:
-        axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0, label="least to most")
-        axes.plot(steps, values.T, color=colour, alpha=0.35, linewidth=0.8)
+        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0, label="range")
+        axes.plot(steps, values.T, color=color, alpha=0.35, linewidth=0.8)
         label = f"median of {len(values)} seeds"
-    axes.plot(steps, median, color=colour, linewidth=2, marker=_marker(steps), label=label)
+    axes.plot(steps, median, color=color, linewidth=2, marker=_marker(steps), label=label)
 
 
 def _marker(steps: np.ndarray) -> str:

@@ -1,4 +1,4 @@
-"""The run folder's files: what was asked (config.json) and what happened (metrics.csv)."""
+"""config.json: the settings that define a run, and the versions that made it."""
 
 import hashlib
 import json
@@ -18,22 +18,22 @@ _PACKAGES = ("qrl", "jax", "jaxlib", "brax", "flax", "optax", "orbax-checkpoint"
 
 
 class TaskRecord(BaseModel):
-    """The task's name as the user gave it and, for our own worlds, everything that the task file said."""
+    """The task's name as the user gave it and, for environments of qrl_envs, the content of its task file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     name: str
-    spec: dict[str, Any] | None  # null: one of Brax's own environments
+    spec: dict[str, Any] | None  # null: an environment of Brax
 
 
 def with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """The content of a config.json, whole or in part, with hyperparameters under today's names."""
+    """The content of a config.json, or a part of one, with hyperparameters under their current names."""
     learner = data.get("learner")
     return data | {"learner": current_names(learner, f"{where}: learner")} if isinstance(learner, dict) else data
 
 
 class ConfigFile(BaseModel):
-    """What CONFIG= may hold: a run's config.json, or any part of one. Versions are for the reader."""
+    """The file of CONFIG=: a run's config.json, or any part of one. Versions and devices are information only."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -47,7 +47,7 @@ class ConfigFile(BaseModel):
 
 
 class RunConfig(BaseModel):
-    """config.json: alone enough to repeat the run."""
+    """config.json: sufficient to repeat the run."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -60,15 +60,15 @@ class RunConfig(BaseModel):
     devices: list[str]
 
     def member(self, index: int) -> "RunConfig":
-        """The config of one of the seeds trained side by side, with as many devices as a seed had: seeds part first."""
+        """The config of one seed, with the devices of one seed: seeds are split across devices first."""
         each = len(self.devices) // math.gcd(self.seeds, len(self.devices))
         return self.model_copy(update={"seed": self.seed + index, "seeds": 1, "devices": self.devices[:each]})
 
     @property
     def sha256(self) -> str:
-        """What tells this run from every other, whatever it is run on."""
-        asked = self.model_dump(mode="json", include={"task", "learner", "seed", "seeds"})
-        return hashlib.sha256(json.dumps(asked, sort_keys=True).encode()).hexdigest()
+        """The fingerprint of the run: task, hyperparameters and seeds, not versions or devices."""
+        settings = self.model_dump(mode="json", include={"task", "learner", "seed", "seeds"})
+        return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
 def versions() -> dict[str, str]:
@@ -76,7 +76,7 @@ def versions() -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of the code that runs, "+" behind it where files have changed since; "unknown" outside a checkout."""
+    """The commit of this code, with a "+" if tracked files have changed since; "unknown" outside a checkout."""
     root = Path(__file__).parents[2]
     try:
         if not (root / ".git").exists():
@@ -91,6 +91,6 @@ def commit() -> str:
     return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
-def members(out: Path, run: RunConfig) -> list[Path]:
-    """The folder of each seed: `out` itself, or out/seed-K for several."""
+def member_folders(out: Path, run: RunConfig) -> list[Path]:
+    """The folder of each seed: `out` itself for one, `out`/seed-K for several."""
     return [out] if run.seeds == 1 else [out / f"seed-{run.seed + i}" for i in range(run.seeds)]

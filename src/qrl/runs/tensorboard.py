@@ -1,6 +1,6 @@
-"""A run's numbers for TensorBoard.
+"""The rows of metrics.csv as TensorBoard events.
 
-tensorboardX's own SummaryWriter hands them to a thread, which dies of a full disk; the training then waits for it.
+tensorboardX's SummaryWriter is not used: its thread dies when the disk is full, and the training then waits for ever.
 """
 
 import math
@@ -17,7 +17,7 @@ from qrl.runs.files import Row, writing
 
 
 class EventLog:
-    """One file of events; TensorBoard drops what earlier files hold from `purge_step` on."""
+    """One event file; TensorBoard discards the events of earlier files from `purge_step` on."""
 
     def __init__(self, folder: Path, purge_step: int) -> None:
         self._folder = folder
@@ -27,7 +27,7 @@ class EventLog:
             self._write(Event(step=purge_step, session_log=SessionLog(status=SessionLog.START)))
 
     def add(self, row: Row) -> None:
-        """The numbers of a report, on disk."""
+        """Write and flush the finite numbers of a report. OSError, naming the folder, if it cannot be written."""
         with writing(self._folder):
             for name, value in row.items():
                 if name != "env_steps" and math.isfinite(value):
@@ -35,7 +35,7 @@ class EventLog:
             self._events.flush()
 
     def close(self) -> None:
-        with suppress(OSError):  # what has to be there was flushed
+        with suppress(OSError):  # every row was flushed already
             self._events.close()
 
     def _write(self, event: Any) -> None:

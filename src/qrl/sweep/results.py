@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from qrl.runs import files, record
-from qrl.runs.files import comparable
+from qrl.runs.files import rank_key
 from qrl.runs.record import RunConfig
 from qrl.sweep.grid import Grid
 from qrl.sweep.runner import Result
@@ -94,7 +94,7 @@ def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | 
 
 def _rank(finding: Finding) -> tuple[bool, float, float]:
     alive = finding["diverged"] < finding["seeds"]
-    return alive, comparable(finding["success"]["median"]), comparable(finding["return_mean"]["median"])
+    return alive, rank_key(finding["success"]["median"]), rank_key(finding["return_mean"]["median"])
 
 
 def ranked(found: list[Finding]) -> list[Finding]:
@@ -106,7 +106,7 @@ def repeat(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
     """The run of a point with its middle seed: the lower median, of those that did not diverge."""
     first = point * len(grid.seeds)
     last = {j: results[first + j].rows[-1] for j in range(len(grid.seeds)) if not results[first + j].diverged}
-    order = sorted(last, key=lambda j: (comparable(last[j]["success"]), comparable(last[j]["return_mean"])))
+    order = sorted(last, key=lambda j: (rank_key(last[j]["success"]), rank_key(last[j]["return_mean"])))
     return RunConfig(
         task=grid.points[point].task,
         learner=grid.points[point].learner,

@@ -12,9 +12,8 @@ import numpy as np
 from qrl.algorithm.flights import Flights
 from qrl.algorithm.types import Env
 from qrl.runs import checkpoint, files, record
-from qrl.runs.checkpoint import Checkpoint
+from qrl.runs.checkpoint import Checkpoint, Record
 from qrl.runs.files import Row
-from qrl.runs.integrity import Record
 from qrl.runs.record import RunConfig
 from qrl.runs.tensorboard import EventLog
 from qrl.training import driver, multihost, restore, sharding
@@ -104,7 +103,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
     mesh = sharding.make_mesh(jax.devices(), run.seeds, run.learner.shard_count)
     trainer = make_trainer(env, run.learner, mesh)
     inputs = stack([member_inputs(env, run.learner)] * run.seeds)
-    folders = record.members(out, run) if multihost.is_coordinator() else []
+    folders = record.member_folders(out, run) if multihost.is_coordinator() else []
     configs = [run.member(i) for i in range(run.seeds)]
     target = restore.abstract_states(trainer, inputs)
     abstract = sharding.abstract_sharded(mesh, target)
@@ -207,11 +206,11 @@ class _Recorder:
             return "", "process 0 reports the last checkpoint"
         member = self._members[i]
         member.checkpoints.wait()
-        saved = checkpoint.steps(member.folder)
+        saved = checkpoint.saved_steps(member.folder)
         kept = f"the checkpoint at step {saved[0]:,} is kept" if saved else "no checkpoint had been made yet"
         return f"{member.folder}: ", kept
 
 
 def finished(out: Path, run: RunConfig) -> bool:
     """Whether the run in `out` is complete: its summaries are written last."""
-    return all((folder / "summary.json").is_file() for folder in {out, *record.members(out, run)})
+    return all((folder / "summary.json").is_file() for folder in {out, *record.member_folders(out, run)})

@@ -38,7 +38,7 @@ def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainS
     with nothing touched, where a checkpoint belongs to another run or version.
     """
     one, notes = _one(target), []
-    common = set.intersection(*[set(checkpoint.steps(folder)) for folder in folders])
+    common = set.intersection(*[set(checkpoint.saved_steps(folder)) for folder in folders])
     for env_steps in sorted(common, reverse=True):
         try:
             found = [checkpoint.read(*member, env_steps, one) for member in zip(folders, configs, strict=True)]
@@ -49,7 +49,7 @@ def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainS
     else:
         env_steps, found = 0, []
     for folder in folders:
-        checkpoint.clear_after(folder, env_steps)
+        checkpoint.discard_after(folder, env_steps)
     where = f"resuming from step {env_steps:,}" if env_steps else "no valid checkpoint; starting from scratch"
     notes = [f"{note}; {where}" for note in notes]
     states = stack([each.state for each in found]) if found else None
@@ -68,7 +68,7 @@ def iter_learners(spec: LearnerSpec, run: RunConfig, folder: Path, most: int) ->
     Each is read when it is asked for. Raises FileNotFoundError, naming the folder, where there is none; OSError where
     one is corrupt, rather than giving an earlier one.
     """
-    saved = checkpoint.steps(folder)
+    saved = checkpoint.saved_steps(folder)
     if not saved:
         raise FileNotFoundError(f"{folder}: no checkpoint")
     nothing: Any = [None] * len(TrainState._fields)
