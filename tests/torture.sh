@@ -8,7 +8,7 @@ cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export JAX_PLATFORMS=cpu QRL_TORTURE=1
 unset MAKEFLAGS MFLAGS MAKELEVEL
 
-files=(tests/{runs/test_kills,training/test_multihost,runs/test_faults,cli/test_fuzz,cli/test_cli}.py)
+files=(tests/{runs/test_kills,training/test_multihost,runs/test_checkpoint,runs/test_faults,cli/test_fuzz,cli/test_cli}.py)
 
 work=$(mktemp -d)
 touch "$work/codes"

@@ -79,8 +79,10 @@ def latest(*folders: Path) -> restore.Restored:
 
 
 def assert_resumes(found: restore.Restored, step: int) -> None:
+    states: Any = found.states
+    assert found.records
     for i, record in enumerate(found.records):
-        state = {name: leaf[i] for name, leaf in found.states.items()}
+        state = {name: leaf[i] for name, leaf in states.items()}
         assert_equal(Checkpoint(found.env_steps, state, record), step)
 
 
