@@ -43,7 +43,9 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     assert isinstance(task, QuadrotorTask)
     one = config.member(0)
     trainer = make_trainer(tasks.environment(config.task), config.learner)
-    learner, env_steps = next(restore.iter_learners(trainer.setup.spec, one, record.member_folders(folder, config)[0], 1))
+    learner, env_steps = next(
+        restore.iter_learners(trainer.setup.spec, one, record.member_folders(folder, config)[0], 1)
+    )
     if trial:
         trainer = make_trainer(OffNominal(task, conditions(task)["trial"]), config.learner)
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)[:starts]

@@ -75,7 +75,7 @@ def all_files(folder: Path) -> list[str]:
 
 
 def latest(*folders: Path) -> restore.Restored:
-    return restore.latest(list(folders), [run_config()] * len(folders), batched(len(folders)))
+    return restore.restore_common(list(folders), [run_config()] * len(folders), batched(len(folders)))
 
 
 def assert_resumes(found: restore.Restored, step: int) -> None:
@@ -177,7 +177,7 @@ def test_checkpoint_of_another_run_is_refused(saved: Path) -> None:
     before = digest(saved)
     for other in (run_config(seed=1), run_config(gamma=0.5)):
         with pytest.raises(IncompatibleCheckpoint, match=r"of another run than config\.json"):
-            restore.latest([saved], [other], batched(1))
+            restore.restore_common([saved], [other], batched(1))
     assert digest(saved) == before
 
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from qrl.algorithm import learner
 from qrl.algorithm.learner import LearnerSpec, LearnerState
 from qrl.runs import checkpoint
-from qrl.runs.integrity import Damaged, Record
+from qrl.runs.checkpoint import Record
+from qrl.runs.integrity import CorruptCheckpoint
 from qrl.runs.record import RunConfig
 from qrl.training import driver
 from qrl.training.state import MemberInputs, TrainState, stack
@@ -34,15 +35,15 @@ def abstract_states(trainer: Trainer, inputs: MemberInputs) -> TrainState:
 def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainState) -> Restored:
     """The last checkpoint that is valid in every member's folder; `target`: shapes and types of all their states.
 
-    Corrupt checkpoints are quarantined; later or unfinished ones are deleted: the run makes them again. Raises Foreign,
-    with nothing touched, where a checkpoint belongs to another run or version.
+    Corrupt checkpoints are quarantined; later or unfinished ones are deleted: the run makes them again. Raises
+    IncompatibleCheckpoint, with nothing changed, if a checkpoint belongs to another run or version of qrl.
     """
     one, notes = _one(target), []
     common = set.intersection(*[set(checkpoint.saved_steps(folder)) for folder in folders])
     for env_steps in sorted(common, reverse=True):
         try:
             found = [checkpoint.read(*member, env_steps, one) for member in zip(folders, configs, strict=True)]
-        except Damaged as error:
+        except CorruptCheckpoint as error:
             notes.append(str(error))
             continue
         break
