@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export view sweep tasks figures ablation gallery bench test smoke lint torture FORCE
+.PHONY: help setup train evaluate export view sweep tasks figures ablation gallery bench test smoke lint docs torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -39,6 +39,7 @@ define HELP
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright
+  make docs                          the pages as a website in site/, links checked
   make torture                       the long fault and fuzz campaign, and the tests with the newest versions
 
 TASK is a name or a path to a .json. `make setup PYTHON=python3.12` picks the interpreter.
@@ -105,6 +106,12 @@ smoke: $(STAMP)
 
 torture: $(STAMP)
 	@exec tests/torture.sh
+
+# The generator is no dependency of qrl: it is installed when it is asked for.
+docs: $(STAMP)
+	@$(PIP) install -r docs/requirements.txt
+	@$(VENV)/bin/python -m mkdocs build --quiet
+	@echo 'site/index.html'
 
 lint: $(STAMP)
 	@$(VENV)/bin/ruff check .

@@ -1,33 +1,121 @@
-"""What README.md and the pages in docs/ show and link is there."""
+"""README and docs: links resolve, commands exist, code compiles, and figures agree with what ships."""
 
+import json
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
+from qrl.cli.main import build_parser
+from qrl.config import Config, preset_names
+
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def anchors(page: Path) -> set[str]:
+    """GitHub's and mkdocs' anchors of a page's headings."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+def fenced(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+
+
+def commands() -> list[str]:
+    found = []
+    for page in PAGES:
+        for block in fenced(page, "sh"):
+            found += [line for line in block.splitlines() if re.match(r"make\b|.*\bqrl (train|evaluate|export|view|sweep)", line)]
+    return sorted(set(found))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
 def test_links_lead_somewhere(page: Path) -> None:
-    """To files beside the page, and to its own headings and anchors."""
-    text = page.read_text(encoding="utf-8")
-    headings = {
-        re.sub(r"[^\w -]", "", line).strip().lower().replace(" ", "-") for line in re.findall(r"^#+ (.+)", text, re.M)
-    }
-    anchors = headings | set(re.findall(r'<a id="([^"]+)">', text))
-    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
-    assert links or page.name != "README.md"
-    for link in links:
-        file, _, anchor = link.partition("#")
-        assert not file or (page.parent / file).exists(), link
-        assert file or anchor in anchors, link
+    for target in LINK.findall(page.read_text(encoding="utf-8")):
+        if re.match(r"https?:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        path = (page.parent / file).resolve() if file else page
+        assert path.exists(), target
+        if anchor and path.suffix == ".md":
+            assert anchor in anchors(path), target
 
 
-@pytest.mark.parametrize("folder", ["docs", "docs/gallery"])
-def test_no_picture_is_left_over(folder: str) -> None:
-    """Each picture in docs/ is shown by some page."""
-    shown = "\n".join(page.read_text(encoding="utf-8") for page in PAGES)
-    for picture in (ROOT / folder).glob("*.png"):
-        assert f"{picture.parent.name}/{picture.name})" in shown, picture
+def test_pages_are_all_in_the_navigation() -> None:
+    navigation = re.findall(r": ([\w/]+\.md)$", (ROOT / "mkdocs.yml").read_text(), flags=re.MULTILINE)
+    assert sorted(navigation) == sorted(page.name for page in PAGES if page.parent.name == "docs")
+
+
+@pytest.mark.parametrize("line", commands())
+def test_commands_exist(line: str) -> None:
+    """The target is in the Makefile, and the parser takes the flags."""
+    words = shlex.split(line, comments=True)
+    parser = build_parser()
+    if words[0] == "make":
+        variables = dict(word.split("=", 1) for word in words[1:] if "=" in word)
+        targets = [word for word in words[1:] if "=" not in word]
+        makefile = (ROOT / "Makefile").read_text()
+        for target in targets:
+            assert re.search(rf"^(\$\(or )?{target}\)?:", makefile, flags=re.MULTILINE), target
+        known = {"TASK", "SEED", "SEEDS", "OUT", "RESUME", "CONFIG", "ARGS", "RUN", "GRID", "FAST", "PYTHON"}
+        assert set(variables) <= known
+        command = targets[0] if targets else ""
+        subject = variables.get({"train": "TASK", "sweep": "GRID"}.get(command, "RUN"), "x")
+        words = [command, subject, *shlex.split(variables.get("ARGS", ""))]
+    else:
+        words = words[next(i for i, word in enumerate(words) if word.endswith("qrl")) + 1 :]
+    if words[0] in ("train", "evaluate", "export", "view", "sweep"):
+        parser.parse_args(words)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_python_compiles(page: Path) -> None:
+    for block in fenced(page, "python"):
+        compile(block, page.name, "exec")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_json_is_json(page: Path) -> None:
+    for block in fenced(page, "json"):
+        json.loads(block)
+
+
+def test_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def test_results_are_of_the_presets_that_ship() -> None:
+    """docs/results.json has two rows for hover and circle, of as many steps as the presets make, and README shows them."""
+    from experiments import results
+
+    found = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
+    assert min(found["seeds"]) >= 100
+    methods = {(row["task"], row["method"]) for row in found["rows"]}
+    assert methods == {(row.task, row.method) for row in results.ROWS}
+    for row in results.ROWS:
+        config = Config.preset(row.task).model_copy(update=row.flags)
+        measured = next(r for r in found["rows"] if (r["task"], r["method"]) == (row.task, row.method))
+        assert measured["steps"] == config.num_unrolls * config.steps_per_unroll
+    assert results.main(["--check", str(ROOT / "README.md")]) == 0
+
+
+def test_presets_named_in_pages_exist() -> None:
+    for page in PAGES:
+        for name in re.findall(r"--preset (\w+)", page.read_text(encoding="utf-8")):
+            assert name in preset_names(), (page.name, name)
+
+
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All code cells, in order, in this process."""
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((ROOT / "docs" / "first_flight.ipynb").read_text(encoding="utf-8"))
+    namespace: dict[str, object] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), "first_flight.ipynb", "exec"), namespace)
+    assert (tmp_path / "runs" / "notebook" / "export" / "qrl_policy.c").exists()
