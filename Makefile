@@ -110,7 +110,7 @@ torture: $(STAMP)
 # The generator is no dependency of qrl: it is installed when it is asked for.
 docs: $(STAMP)
 	@$(PIP) install -r docs/requirements.txt
-	@$(VENV)/bin/python -m mkdocs build --quiet
+	@NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --quiet
 	@echo 'site/index.html'
 
 lint: $(STAMP)
