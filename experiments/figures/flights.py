@@ -38,4 +38,5 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     assert isinstance(task, QuadrotorTask)
     env = OffNominal(task, conditions(task)["trial"]) if trial else None
     flights = run.fly(evaluation_starts()[:starts], env)
-    return Flown(run.config.seed, run.env_steps, task, np.asarray(flights.observations), flights.measures)
+    measures = {name: np.asarray(value) for name, value in flights.measures.items()}
+    return Flown(run.config.seed, run.env_steps, task, np.asarray(flights.observations), measures)
