@@ -33,7 +33,7 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     With `trial` position and velocity at the start are the paper's trial's; attitude, of which the paper does not tell,
     and body rates remain the start's own. BadInput or OSError, in a line, where the run cannot be read.
     """
-    run = TrainedRun.load(record.members(folder, tasks.load_run_config(folder))[0])
+    run = TrainedRun.load(record.member_folders(folder, tasks.load_run_config(folder))[0])
     task = run.task
     assert isinstance(task, QuadrotorTask)
     env = OffNominal(task, conditions(task)["trial"]) if trial else None
