@@ -3,19 +3,14 @@
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from qrl import tasks
-from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED
+from qrl.evaluation.starts import STARTS, evaluation_starts
+from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import record
-from qrl.training import restore
-from qrl.training.state import member_inputs, stack
-from qrl.training.trainer import make_trainer
 from qrl_envs.perturbations import OffNominal, conditions
 from qrl_envs.task import QuadrotorTask
-
-STARTS = 1000  # those of `make evaluate`; what is drawn are the first of them
 
 
 class Flown(NamedTuple):
@@ -38,17 +33,10 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     With `trial` position and velocity at the start are the paper's trial's; attitude, of which the paper does not tell,
     and body rates remain the start's own. BadInput or OSError, in a line, where the run cannot be read.
     """
-    config = tasks.load_run_config(folder)
-    task = tasks.spec(config.task)
+    run = TrainedRun.load(record.member_folders(folder, tasks.load_run_config(folder))[0])
+    task = run.task
     assert isinstance(task, QuadrotorTask)
-    one = config.member(0)
-    trainer = make_trainer(tasks.environment(config.task), config.learner)
-    learner, env_steps = next(
-        restore.iter_learners(trainer.setup.spec, one, record.member_folders(folder, config)[0], 1)
-    )
-    if trial:
-        trainer = make_trainer(OffNominal(task, conditions(task)["trial"]), config.learner)
-    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)[:starts]
-    found = trainer.fly(learner, stack([member_inputs(trainer.setup.env, config.learner)]), keys)
-    found = jax.tree.map(lambda x: np.asarray(x)[0], found)
-    return Flown(one.seed, env_steps, task, found.observations, found.measures)
+    env = OffNominal(task, conditions(task)["trial"]) if trial else None
+    flights = run.fly(evaluation_starts()[:starts], env)
+    measures = {name: np.asarray(value) for name, value in flights.measures.items()}
+    return Flown(run.config.seed, run.env_steps, task, np.asarray(flights.observations), measures)
