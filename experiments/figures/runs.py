@@ -41,18 +41,20 @@ class Wanted(NamedTuple):
     preset: str  # whose values the flags are laid over
     flags: dict[str, Any]  # of `qrl train`, by the names of qrl.config
     seeds: int = 1
+    seed: int = 0
 
     @property
     def words(self) -> list[str]:
         """The command, but for its --out."""
         preset = [] if self.preset == self.task else ["--preset", self.preset]
         flags = [word for name, value in self.flags.items() for word in (f"--{name.replace('_', '-')}", f"{value}")]
-        return ["train", self.task, "--seeds", str(self.seeds), *preset, *flags]
+        seed = ["--seed", str(self.seed)] * bool(self.seed)
+        return ["train", self.task, *seed, "--seeds", str(self.seeds), *preset, *flags]
 
     def config(self) -> RunConfig:
         """What its config.json says if it is made now."""
         file = ConfigFile(learner=tasks.preset(self.preset, self.name))
-        return request.run_config(self.task, None, file, self.flags, 0, self.seeds)
+        return request.run_config(self.task, None, file, self.flags, self.seed, self.seeds)
 
 
 def wanted(*, fast: bool) -> list[Wanted]:
@@ -153,7 +155,7 @@ def _imports(path: Path) -> list[str]:
 # How a run is made
 
 
-def make(one: Wanted, folder: Path) -> float:
+def make(one: Wanted, folder: Path, env: dict[str, str] | None = None) -> float:
     """Make the run as a user would, in a process of its own; an unfinished one of the same is gone on with.
 
     Returns its seconds; raises Failed. What else the folder held is removed.
@@ -166,15 +168,15 @@ def make(one: Wanted, folder: Path) -> float:
         folder.mkdir(parents=True)
         (folder / CODE).write_text(sha256())
     begun = time.perf_counter()
-    qrl(words)
+    qrl(words, env)
     return time.perf_counter() - begun
 
 
-def qrl(words: list[str]) -> None:
-    """The command line in a process of its own; Failed if it fails."""
+def qrl(words: list[str], env: dict[str, str] | None = None) -> None:
+    """The command line in a process of its own, with `env` added to its environment; Failed if it fails."""
     command = [sys.executable, "-m", "qrl", *words]
     # In a session of its own, so that Ctrl-C reaches it once: through us.
-    with subprocess.Popen(command, env=environment(), start_new_session=True) as process:
+    with subprocess.Popen(command, env=environment() | (env or {}), start_new_session=True) as process:
         try:
             code = process.wait()
         except BaseException:
