@@ -1,6 +1,6 @@
 """The numbers of README's tables: docs/results.json, from runs of the shipped presets with seeds 100 to 104.
 
-    .venv/bin/python -m experiments.results [--out docs/results.json] [--runs experiments/out/results] [--fresh] [--list]
+    .venv/bin/python -m experiments.results [--out FILE] [--runs FOLDER] [--fresh] [--list]
     .venv/bin/python -m experiments.results --check README.md …
     .venv/bin/python -m experiments.results --write README.md …
 
@@ -20,11 +20,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments.arguments import Parser, run_to_the_end
+from experiments.arguments import Parser, run_main
 from experiments.bench.run import machine
 from experiments.figures import runs
-from experiments.figures.runs import Failed, Wanted
-from experiments.markdown import table
+from experiments.figures.runs import Failed, RunSpec
+from experiments.output import table
 from qrl.runs import files, record
 from qrl_envs.specfile import BadInput
 
@@ -42,8 +42,8 @@ class Row(NamedTuple):
     method: str
     flags: dict[str, Any]
 
-    def run(self, seed: int) -> Wanted:
-        return Wanted(f"{self.task}{'-paper' * bool(self.flags)}/{seed}", self.task, self.task, self.flags, seed=seed)
+    def run(self, seed: int) -> RunSpec:
+        return RunSpec(f"{self.task}{'-paper' * bool(self.flags)}/{seed}", self.task, self.task, self.flags, seed=seed)
 
 
 ROWS = (
@@ -105,13 +105,13 @@ def measure(folder: Path, *, fresh: bool) -> dict[str, Any]:
     return found
 
 
-def train(run: Wanted, out: Path, *, fresh: bool) -> float:
+def train(run: RunSpec, out: Path, *, fresh: bool) -> float:
     """Train unless the run is current; the wall seconds of the whole command, with an empty compile cache."""
     seconds, cache = out / "command_seconds", out.with_name(f"{out.name}-cache")
-    if fresh or not seconds.exists() or not runs.current(out, run.config()):
+    if fresh or not seconds.exists() or not runs.is_current(out, run.config()):
         shutil.rmtree(out, ignore_errors=True)
         print(f"results: qrl {' '.join(run.words)}", flush=True)
-        took = runs.make(run, out, {"JAX_COMPILATION_CACHE_DIR": str(cache.absolute())})
+        took = runs.train(run, out, {"JAX_COMPILATION_CACHE_DIR": str(cache.absolute())})
         shutil.rmtree(cache, ignore_errors=True)
         files.replace_text(seconds, f"{took:.1f}\n")
     return float(seconds.read_text())
@@ -193,22 +193,22 @@ def cell(values: dict[str, float | None] | None, factor: float, form: str, unit:
     return shown if median == none else f"{shown}{unit}"
 
 
-def fill(paths: list[Path], made: dict[str, str], *, write: bool) -> int:
-    """Compare the marked tables of files with `made`, or replace them; 1 if one differs."""
+def fill(paths: list[Path], expected: dict[str, str], *, write: bool) -> int:
+    """Compare the marked tables of files with `expected`, or replace them; 1 if one differs."""
     differ = 0
     for path in paths:
         text = path.read_text(encoding="utf-8")
         for _, name, body, _ in MARKED.findall(text):
-            if name not in made:
-                raise ValueError(f"{path}: no table '{name}' (known: {', '.join(made)})")
-            if body.strip() != made[name] and not write:
+            if name not in expected:
+                raise ValueError(f"{path}: no table '{name}' (known: {', '.join(expected)})")
+            if body.strip() != expected[name] and not write:
                 print(f"results: {path}: table '{name}' differs from docs/results.json", file=sys.stderr)
                 differ = 1
         if write:
-            files.replace_text(path, MARKED.sub(lambda match: f"{match[1]}{made[match[2]]}\n{match[4]}", text))
+            files.replace_text(path, MARKED.sub(lambda match: f"{match[1]}{expected[match[2]]}\n{match[4]}", text))
     return differ
 
 
 if __name__ == "__main__":
     jax.config.update("jax_platforms", "cpu")  # a GPU is the runs'
-    run_to_the_end("results", main)
+    run_main("results", main)

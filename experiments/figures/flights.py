@@ -18,13 +18,13 @@ from qrl_envs.task import QuadrotorTask
 STARTS = 1000  # those of `make evaluate`; what is drawn are the first of them
 
 
-class Flown(NamedTuple):
+class PolicyFlights(NamedTuple):
     """Flights of one policy, SI units."""
 
     seed: int
-    env_steps: int  # after so many of training
+    env_steps: int  # of training
     task: QuadrotorTask
-    observations: np.ndarray  # [n, K + 1, 18] at times 0, dt, … K·dt; NaN from where one ended early
+    observations: np.ndarray  # [n, K + 1, 18] at times 0, dt, … K·dt; NaN after an early end
     measures: dict[str, np.ndarray]  # of measures.py -> [n]
 
     @property
@@ -32,11 +32,11 @@ class Flown(NamedTuple):
         return np.arange(self.observations.shape[1]) * self.task.control_period_s
 
 
-def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
+def fly_policy(folder: Path, *, trial: bool = False, starts: int = STARTS) -> PolicyFlights:
     """The last policy of a run's first seed, from the first starts of `make evaluate`.
 
-    With `trial` position and velocity at the start are the paper's trial's; attitude, of which the paper does not tell,
-    and body rates remain the start's own. BadInput or OSError, in a line, where the run cannot be read.
+    With `trial`, the initial position and velocity are those of the paper's trial; attitude, which the paper does not
+    give, and body rates are those of the start. Raises BadInput or OSError where the run cannot be read.
     """
     config = tasks.load_run_config(folder)
     task = tasks.spec(config.task)
@@ -51,4 +51,4 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)[:starts]
     found = trainer.fly(learner, stack([member_inputs(trainer.setup.env, config.learner)]), keys)
     found = jax.tree.map(lambda x: np.asarray(x)[0], found)
-    return Flown(one.seed, env_steps, task, found.observations, found.measures)
+    return PolicyFlights(one.seed, env_steps, task, found.observations, found.measures)
