@@ -14,6 +14,7 @@ import os
 import re
 import shutil
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -132,7 +133,7 @@ def summary(row: Row, evaluations: list[dict[str, Any]], seconds: list[float]) -
     }
 
 
-def spread(name: str, values: list[float | None]) -> dict[str, float | None]:
+def spread(name: str, values: Sequence[float | None]) -> dict[str, float | None]:
     """Median and worst; null is infinitely bad (a settle time) or not measured by the task."""
     worst = min if name.startswith(("return_", "success")) else max
     bad = -math.inf if worst is min else math.inf
