@@ -33,6 +33,12 @@ RESULTS, RUNS = Path("docs/results.json"), Path("experiments/out/results")
 SEEDS = tuple(range(100, 105))
 PAPER = {"apg_fraction": 0.0, "num_timesteps": 4_500_000}
 ALONE, WITH_APG = "paper's method alone", "with APG"
+STEADY = (  # measure, label, factor, format, unit
+    ("rms_position_m", "", 1e3, ".1f", " mm"),
+    ("rms_radius_m", "radius ", 1e3, ".1f", " mm"),
+    ("rms_height_m", "height ", 1e3, ".1f", " mm"),
+    ("rms_speed_m_s", "speed ", 1.0, ".3f", " m/s"),
+)
 MARKED = re.compile(r"(<!-- results:(\w+) -->\n)(.*?)(<!-- /results -->)", re.DOTALL)
 
 
@@ -148,50 +154,49 @@ def spread(name: str, values: Sequence[float | None]) -> dict[str, float | None]
 
 
 def tables(path: Path = RESULTS) -> dict[str, str]:
-    """The Markdown tables of docs/results.json by name: `results` and `controllers`."""
+    """The Markdown tables of docs/results.json by name: `summary` (the worst seed of each row) and `controllers`."""
     found = json.loads(path.read_text(encoding="utf-8"))
-    rows = [[row["task"], row["method"], f"{row['steps'] / 1e6:.1f}M", *cells(row)] for row in found["rows"]]
-    for row, one in zip(rows, found["rows"], strict=True):
-        row.append(f"{one['command_seconds']['median']:.0f} s")
-    single = [
-        [task, name, *cells({key: {"median": x, "worst": x} for key, x in one.items() if key != "off_nominal"})]
+    summaries = [
+        [row["task"], row["method"], f"{row['steps'] / 1e6:.1f}M", *cells(worst(row)), seconds(row)]
+        for row in found["rows"]
+    ]
+    controllers = [
+        [task, name, *cells(measures)]
         for task, baselines in found["baselines"].items()
-        for name, one in baselines.items()
+        for name, measures in baselines.items()
     ]
     heads = ["return", "success", "settle, median", "settle, p95", "steady state"]
     return {
-        "results": table(["task", "method", "steps", *heads, "whole command"], rows),
-        "controllers": table(["task", "controller", *heads], single),
+        "summary": table(["task", "method", "steps", *heads, "time of `qrl train`"], summaries),
+        "controllers": table(["task", "controller", *heads], controllers),
     }
 
 
-def cells(row: dict[str, Any]) -> list[str]:
-    """Return, success, settle times and steady-state errors; "median (worst)" where these differ."""
-    steady = [
-        f"{label}{cell(row[name], factor, form, unit)}"
-        for name, label, factor, form, unit in (
-            ("rms_position_m", "", 1e3, ".1f", " mm"),
-            ("rms_radius_m", "radius ", 1e3, ".1f", " mm"),
-            ("rms_height_m", "height ", 1e3, ".1f", " mm"),
-            ("rms_speed_m_s", "speed ", 1.0, ".3f", " m/s"),
-        )
-        if name in row
-    ]
+def worst(row: dict[str, Any]) -> dict[str, float | None]:
+    return {name: value["worst"] for name, value in row.items() if isinstance(value, dict)}
+
+
+def seconds(row: dict[str, Any]) -> str:
+    return f"{row['command_seconds']['median']:.0f} s"
+
+
+def cells(measures: dict[str, float | None]) -> list[str]:
+    """Return, success, settle times and steady-state errors."""
+
+    def cell(name: str, factor: float, form: str, unit: str) -> str:
+        value = measures.get(name)
+        if value is None:
+            return "never" if name.startswith("settle") and name in measures else "–"
+        return f"{factor * value:{form}}{unit}"
+
+    steady = [f"{label}{cell(name, *how)}" for name, label, *how in STEADY if name in measures]
     return [
-        cell(row.get("return_mean"), 1.0, ".1f", ""),
-        cell(row.get("success"), 100.0, ".1f", " %"),
-        cell(row.get("settle_median_s"), 1.0, ".2f", " s", "never"),
-        cell(row.get("settle_p95_s"), 1.0, ".2f", " s", "never"),
+        cell("return_mean", 1.0, ".1f", ""),
+        cell("success", 100.0, ".1f", " %"),
+        cell("settle_median_s", 1.0, ".2f", " s"),
+        cell("settle_p95_s", 1.0, ".2f", " s"),
         ", ".join(steady) or "–",
     ]
-
-
-def cell(values: dict[str, float | None] | None, factor: float, form: str, unit: str, none: str = "–") -> str:
-    if values is None:
-        return "–"
-    median, worst = (none if x is None else f"{factor * x:{form}}" for x in (values["median"], values["worst"]))
-    shown = median if median == worst else f"{median} ({worst})"
-    return shown if median == none else f"{shown}{unit}"
 
 
 def fill(paths: list[Path], expected: dict[str, str], *, write: bool) -> int:

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from qrl.runs import files, record
 from qrl.training import restore
 from qrl.training.driver import seeds
 from qrl.training.state import member_inputs, stack
-from qrl.training.trainer import Trainer, make_trainer
+from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs import task
 
@@ -288,11 +289,12 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     small = HOVER._replace(flags={"policy_hidden_layer_sizes": (4,), "critic_hidden_layer_sizes": (4,)}, seeds=1)
     folder, config = folder_of(tmp_path / "run", small), small.config()
 
-    def untrained(env: Any, *_: object) -> tuple[Trainer, Any, int]:
+    def untrained(*_: object) -> Iterator[tuple[Any, int]]:
+        env = worlds.make("hover")
         trainer = make_trainer(env, config.learner)
-        return trainer, trainer.init(seeds(0, 1), stack([member_inputs(env, config.learner)])).learner, 7
+        yield trainer.init(seeds(0, 1), stack([member_inputs(env, config.learner)])).learner, 7
 
-    monkeypatch.setattr(restore, "last", untrained)
+    monkeypatch.setattr(restore, "iter_learners", untrained)
     trial, nominal = (figure_flights.fly_policy(folder, trial=trial, starts=2) for trial in (True, False))
     for began in trial.observations[:, 0]:
         np.testing.assert_allclose(began[9:15], [-1.58, 0.99, 1.45, -2.39, 6.20, 0.77], rtol=1e-6)
