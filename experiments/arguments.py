@@ -4,6 +4,7 @@ import argparse
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 
@@ -18,9 +19,14 @@ class Parser(argparse.ArgumentParser):
         print(f"{self.prog}: {message}", file=sys.stderr)
         sys.exit(2)
 
+    def check_folder(self, flag: str, path: Path) -> None:
+        """Exit with an error if the folder that `flag` names is a file."""
+        if path.exists() and not path.is_dir():
+            self.error(f"{flag}: {path} is a file; expected a folder, or a name for a new one")
 
-def run_to_the_end(prog: str, main: Callable[[], int]) -> NoReturn:
-    """Exit as `main` says; Ctrl-C or SIGTERM first ends the run at work, which would go on alone, and is one line."""
+
+def run_main(prog: str, main: Callable[[], int]) -> NoReturn:
+    """Exit with the code of `main`. Ctrl-C and SIGTERM first end the child process and print one line."""
 
     def stop(*_: object) -> NoReturn:
         raise KeyboardInterrupt
@@ -29,5 +35,5 @@ def run_to_the_end(prog: str, main: Callable[[], int]) -> NoReturn:
     try:
         sys.exit(main())
     except KeyboardInterrupt:
-        print(f"{prog}: interrupted; the same command goes on", file=sys.stderr)
+        print(f"{prog}: interrupted; the same command resumes", file=sys.stderr)
         sys.exit(1)

@@ -55,7 +55,7 @@ class Solved(Exception):
     """Thrown through `train`, which offers no other way to end early."""
 
 
-def mend_jax() -> None:
+def add_device_put_replicated_shim() -> None:
     """Brax 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 no longer has: a copy on each device."""
 
     def device_put_replicated(tree: Any, devices: list[Any]) -> Any:
@@ -137,14 +137,14 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=float, default=1e6)
     args = parser.parse_args()
-    mend_jax()
+    add_device_put_replicated_shim()
     steps = int(args.steps)
     if args.task == "pendulum":
-        learn("pendulum", args.seed, steps, PENDULUM, pendulum_judge().hear_jax(), every=20_480)
+        learn("pendulum", args.seed, steps, PENDULUM, pendulum_judge().listen_to_jax(), every=20_480)
     else:
         steps_of, episodes = EPISODE_STEPS[args.task], EPISODES_A_CHECK[args.task]
         settings = QUADROTOR | {"episode_length": steps_of, "num_resets_per_eval": episodes}
-        judge = success_judge(flights(envs.get_environment(args.task))).hear_jax()
+        judge = success_judge(flights(envs.get_environment(args.task))).listen_to_jax()
         learn(args.task, args.seed, steps, settings, judge, every=episodes * steps_of * QUADROTOR["num_envs"])
 
 

@@ -17,7 +17,7 @@ from brax.training import acting as brax_acting
 from brax.training.agents.ppo import networks, train
 
 import qrl_envs  # noqa: F401 - registers our environments with Brax
-from brax_ppo import NETWORKS, mend_jax
+from brax_ppo import NETWORKS, add_device_put_replicated_shim
 from judge import report
 from rates import LANES, TRAINING, UNROLL_STEPS, rate
 
@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=["acting", "training"], default=["acting", "training"])
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    mend_jax()
+    add_device_put_replicated_shim()
     if "acting" in args.only:
         for lanes in LANES:
             acting(lanes, args.seed)

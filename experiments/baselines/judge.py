@@ -82,7 +82,7 @@ class Judge:
         self._spawned = float(os.environ.get("BENCH_SPAWNED", time.time()))
         self._budget = float(os.environ.get("BENCH_BUDGET_SECONDS", "inf"))
 
-    def hear_jax(self) -> "Judge":
+    def listen_to_jax(self) -> "Judge":
         """Count what JAX compiles from here on."""
         import jax  # in the contestant's environment, if it has one
 

@@ -19,17 +19,17 @@ from typing import Any
 
 from judge import report
 
-TOLD = ("success", "settle_median_s", "settle_p95_s", "return_mean")
+MEASURES = ("success", "settle_median_s", "settle_p95_s", "return_mean")
 CHECKPOINTS = 5
 QUADROTORS = ("hover", "circle")
 
 
-def told(found: dict[str, Any]) -> dict[str, float | None]:
-    """What is told of an evaluation.json; None: no finite number."""
+def summary(found: dict[str, Any]) -> dict[str, float | None]:
+    """The measures of an evaluation.json; None: not finite."""
     steady = [name for name in found if name.startswith("rms_")]
     of_each = {name: [one[name] for one in found["checkpoints"]] for name in steady}
     return {
-        **{name: value for name, value in found.items() if name in TOLD or name in steady},
+        **{name: value for name, value in found.items() if name in MEASURES or name in steady},
         **{f"worst_of_{len(v)}_{name}": None if None in v else max(v) for name, v in of_each.items()},
         **{f"off_nominal_success_{name}": one["success"] for name, one in found.get("off_nominal", {}).items()},
     }
@@ -60,7 +60,7 @@ def main() -> None:
             "train_seconds": last["train_seconds"],
             "total_seconds": seconds,
             "other_seconds": seconds - last["train_seconds"],
-            **told(found),
+            **summary(found),
         }
     )
 

@@ -67,7 +67,7 @@ def main() -> None:
 
     judge: Judge = pendulum_judge() if args.task == "pendulum" else success_judge(flights)
     judged = pendulum_judged(trainer)
-    judge.hear_jax().start()
+    judge.listen_to_jax().start()
     states = trainer.init(driver.seeds(run.seed, 1), points)
     advance, climb = driver.compile_train(trainer, states, points), driver.compile_apg(trainer, states, points)
     pieces = min(args.checks, config.num_unrolls)

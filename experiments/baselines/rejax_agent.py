@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=float, default=3e5)
     args = parser.parse_args()
-    judge = pendulum_judge().hear_jax()
+    judge = pendulum_judge().listen_to_jax()
     maker, settings, every = AGENTS[args.agent]
     agent = maker.create(**settings, total_timesteps=every, eval_freq=every, skip_initial_evaluation=True)
     agent = agent.replace(eval_callback=lambda *_: jnp.float32(0.0))

@@ -36,7 +36,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=float, default=2e4)
     args = parser.parse_args()
-    judge = pendulum_judge().hear_jax()
+    judge = pendulum_judge().listen_to_jax()
     judge.start()
     model = SAC("MlpPolicy", "Pendulum-v1", learning_rate=1e-3, seed=args.seed)
     model.learn(int(args.steps), callback=Checked(judge))

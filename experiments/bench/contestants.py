@@ -1,4 +1,4 @@
-"""Who is timed at what: one line each. Scripts and their environments' requirements: experiments/baselines."""
+"""The contestants of each benchmark. Their scripts and requirements are in experiments/baselines."""
 
 from typing import NamedTuple
 
@@ -6,7 +6,7 @@ GROUPS = {
     "pendulum": "Pendulum-v1, until the mean return of 1,000 starts reaches −150",
     "hover": "hover, until 99 % of 1,000 starts succeed",
     "circle": "circle, until 99 % of 1,000 starts succeed",
-    "commands": "whole commands with the defaults that ship, the last policy judged",
+    "commands": "whole commands with the defaults that ship, the last policy evaluated",
     "speed": "steps and samples a second",
 }
 
@@ -17,10 +17,10 @@ class Contestant(NamedTuple):
     script: str
     words: tuple[str, ...] = ()
     environment: str | None = None  # requirements of that name; None: qrl's own
-    devices: int | None = None  # of the CPU, as JAX is told; None: as the contestant itself says
+    devices: int | None = None  # CPU devices given to JAX; None: the contestant's own choice
 
 
-QRL = "qrl"  # how a group's own contestant, which ratios are to, begins
+QRL = "qrl"  # the contestant of each group that ratios refer to
 
 CONTESTANTS = (
     Contestant("qrl", "pendulum", "qrl_train.py", ("pendulum",)),
@@ -49,12 +49,12 @@ CONTESTANTS = (
 
 
 def key(contestant: Contestant) -> str:
-    """What a contestant is called in files and on the command line: `pendulum/brax-ppo`."""
+    """The contestant's name in files and on the command line: `pendulum/brax-ppo`."""
     return f"{contestant.group}/{contestant.name.lower().replace(',', '').replace(' ', '-')}"
 
 
 def chosen(words: list[str]) -> list[Contestant]:
-    """Those that `words` (groups, or keys as `key` makes them) name, in the table's order; ValueError, in a line."""
+    """The contestants named by `words` (groups or keys), in the table's order; raises ValueError."""
     known = {key(contestant) for contestant in CONTESTANTS} | GROUPS.keys()
     for word in words:
         if word not in known:

@@ -1,4 +1,4 @@
-"""Peers' environments: one for each requirements file, made once, outside of git, and never shared with qrl's own."""
+"""Virtual environments of the baselines, one for each requirements file, separate from qrl's own."""
 
 import hashlib
 import shutil
@@ -8,14 +8,14 @@ from pathlib import Path
 
 
 class NotInstalled(Exception):
-    """Why a peer could not be installed, in a line."""
+    """A baseline could not be installed; the message is one line."""
 
 
 def python_of(requirements: Path, folder: Path) -> Path:
-    """The interpreter of an environment that holds just what `requirements` pins; made in `folder` if need be.
+    """The interpreter of the environment in `folder` with what `requirements` pins, created if missing or stale.
 
-    The stamp, which is the hash of what was asked for, is written last: an installation that was interrupted, or that
-    was asked for with other pins, is made anew. NotInstalled, in a line, if it can't be.
+    The stamp, a hash of the requirements, is written last, so that an interrupted installation is repeated. Raises
+    NotInstalled.
     """
     python, stamp = folder / "bin" / "python", folder / "installed"
     wanted = fingerprint(requirements)
@@ -29,14 +29,14 @@ def python_of(requirements: Path, folder: Path) -> Path:
     ):
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
-            said = [line for line in (done.stderr or done.stdout).splitlines() if "error" in line.lower()]
-            raise NotInstalled((said or ["pip failed"])[-1].strip())
+            errors = [line for line in (done.stderr or done.stdout).splitlines() if "error" in line.lower()]
+            raise NotInstalled((errors or ["pip failed"])[-1].strip())
     stamp.write_text(wanted)
     return python
 
 
 def fingerprint(requirements: Path) -> str:
-    """Of a requirements file, of those that it names in turn, and of the Python that installs them."""
+    """A hash of a requirements file, the files it includes, and the Python version."""
     digest = hashlib.sha256(sys.version.encode())
     for path in _with_included(requirements):
         digest.update(path.read_bytes())

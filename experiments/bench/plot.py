@@ -1,4 +1,4 @@
-"""The ratios as one picture: how many times qrl's time a peer takes, or how many times its rate qrl reaches."""
+"""The ratios as one plot: how many times qrl's time another takes, or how many times its rate qrl reaches."""
 
 import math
 import textwrap
@@ -10,9 +10,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-from experiments.bench.tables import BARS, QRL, Run, Spread, by_seed, figures, number, ratios, untold
+from experiments.bench.tables import BARS, QRL, Run, Spread, by_seed, figures, number, ratios, strip_device_suffix
 
-COLOURS = {"training": "#0072B2", "total": "#E69F00", "speed": "#009E73"}  # of Okabe and Ito
+COLORS = {"training": "#0072B2", "total": "#E69F00", "speed": "#009E73"}  # of Okabe and Ito
 NAMES = {
     "training": "training seconds, theirs / qrl's",
     "total": "seconds from start to solved, theirs / qrl's",
@@ -24,11 +24,11 @@ class Bar(NamedTuple):
     label: str
     kind: str
     ratio: Spread
-    bound: bool  # the peer did not come so far: the ratio is at least this
+    bound: bool  # not solved: the ratio is a lower bound
 
 
 def bars(runs: list[Run]) -> list[Bar]:
-    """A bar for each ratio that is there; for a peer that mostly failed, what its budget says at least."""
+    """A bar for each ratio that is there; for one that mostly failed, a lower bound from its budget."""
     found: list[Bar] = []
     for group in BARS:
         mine = [run for run in runs if run["group"] == group]
@@ -46,7 +46,7 @@ def bars(runs: list[Run]) -> list[Bar]:
                     found.append(Bar(f"{group}: {who}", kind, ratio, bound))
     rates = figures([run for run in runs if run["group"] == "speed"])
     for figure, values in rates.items():
-        ours = rates.get(untold(figure), {}).get(QRL, {})
+        ours = rates.get(strip_device_suffix(figure), {}).get(QRL, {})
         for who in values:
             if who != QRL and (ratio := ratios(ours, values[who])):
                 found.append(Bar(f"{figure}: {who}", "speed", ratio, False))
@@ -66,16 +66,16 @@ def plot(path: Path, runs: list[Run]) -> None:
             bar.ratio.median - 1.0,
             left=1.0,
             height=0.7,
-            color="white" if bar.bound else COLOURS[bar.kind],
-            edgecolor=COLOURS[bar.kind],
+            color="white" if bar.bound else COLORS[bar.kind],
+            edgecolor=COLORS[bar.kind],
             hatch="///" if bar.bound else None,
             xerr=[[low], [high]],
             ecolor="#333333",
             capsize=2,
         )
-        told = f"{'> ' if bar.bound else ''}{number(bar.ratio.median)}×"
+        text = f"{'> ' if bar.bound else ''}{number(bar.ratio.median)}×"
         axes.annotate(
-            told, (max(bar.ratio.greatest, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8
+            text, (max(bar.ratio.greatest, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8
         )
     axes.set_xscale("log")
     axes.axvline(1.0, color="#333333", linewidth=1.0)
@@ -85,8 +85,8 @@ def plot(path: Path, runs: list[Run]) -> None:
     axes.set_xlabel(
         "times qrl (median, range over seeds)\nhatched: not solved within the budget, so at least this", fontsize=9
     )
-    kinds = [kind for kind in COLOURS if any(bar.kind == kind for bar in found)]
-    patches = [plt.Rectangle((0, 0), 1, 1, color=COLOURS[kind]) for kind in kinds]
+    kinds = [kind for kind in COLORS if any(bar.kind == kind for bar in found)]
+    patches = [plt.Rectangle((0, 0), 1, 1, color=COLORS[kind]) for kind in kinds]
     axes.legend(
         patches,
         [NAMES[kind] for kind in kinds],

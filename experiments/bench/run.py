@@ -1,11 +1,12 @@
-"""qrl beside its peers, each in an environment of its own, in turn on this machine: `make bench`.
+"""Timings of qrl beside other trainers and simulators, one at a time: `make bench`.
 
     .venv/bin/python -m experiments.bench.run [--out experiments/out/bench] [--only pendulum hover/qrl …] [--seeds 5]
                                           [--budget-seconds 150] [--fresh] [--list]
 
-Seed by seed, all contestants of a seed before the next one, each run a process of its own. A run that is finished is
-kept in OUT/runs and not made again (unless --fresh); a bench that was killed goes on there. Leaves bench.json (every
-run), bench.md (tables) and bench.png (ratios). A peer that cannot be installed is said so and skipped.
+Seed by seed, all contestants of a seed before the next one, each run a process of its own. Finished runs are kept in
+OUT/runs (unless --fresh); an interrupted benchmark is resumed. Writes bench.json (every run), bench.md (tables) and
+bench.png (ratios). Each baseline has a virtual environment of its own; one that cannot be installed is reported and
+skipped.
 """
 
 import argparse
@@ -21,19 +22,20 @@ import time
 from pathlib import Path
 from typing import Any
 
-from experiments.arguments import Parser, run_to_the_end
+from experiments.arguments import Parser, run_main
 from experiments.bench.contestants import CONTESTANTS, Contestant, chosen, key
 from experiments.bench.install import NotInstalled, fingerprint, python_of
 from experiments.bench.plot import plot
 from experiments.bench.tables import Run, page
 from experiments.figures import runs as figure_runs
 from qrl.config import load_preset, preset_names
+from qrl.runs import files
 from qrl.runs import record as records
 
 ROOT = Path(__file__).resolve().parents[2]
-PEERS = ROOT / "experiments" / "baselines"
+BASELINES = ROOT / "experiments" / "baselines"
 GRACE_SECONDS = 120.0  # beyond a run's budget, for its checks
-MARK = "BENCH "  # before a line meant for us
+MARK = "BENCH "  # prefix of a result line
 OUT_OF_TIME = "out of time"
 FINISHED = ("done", OUT_OF_TIME)
 
@@ -46,17 +48,16 @@ def main(argv: list[str] | None = None) -> int:
         "--only", nargs="+", default=[], help="groups or contestants, as --list has them", metavar="NAME"
     )
     parser.add_argument("--seeds", type=int, default=5, metavar="N")
-    parser.add_argument("--budget-seconds", type=float, default=150.0, help="of one run", metavar="S")
-    parser.add_argument("--fresh", action="store_true", help="make finished runs again")
-    parser.add_argument("--list", action="store_true", help="say who there is")
+    parser.add_argument("--budget-seconds", type=float, default=150.0, help="time limit of one run", metavar="S")
+    parser.add_argument("--fresh", action="store_true", help="repeat finished runs")
+    parser.add_argument("--list", action="store_true", help="print the contestants and exit")
     args = parser.parse_args(argv)
     if args.list:
         print("\n".join(key(contestant) for contestant in CONTESTANTS))
         return 0
     if args.seeds < 1 or not args.budget_seconds > 0:
         parser.error("expected --seeds of at least 1 and --budget-seconds above 0")
-    if args.out.exists() and not args.out.is_dir():
-        parser.error(f"--out: {args.out} is a file; expected a folder, or a name for a new one")
+    parser.check_folder("--out", args.out)
     try:
         contestants = chosen(args.only)
     except ValueError as error:
@@ -70,26 +71,30 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def bench(contestants: list[Contestant], args: argparse.Namespace) -> None:
-    """All runs that are not there yet, and the three files anew after each seed."""
+    """Run what is missing or stale; write the three files after each seed."""
     folder = args.out / "runs"
     folder.mkdir(parents=True, exist_ok=True)
-    pythons, absent = installed(contestants, PEERS, args.environments)
+    pythons, absent = installed(contestants, BASELINES, args.environments)
     for seed in range(args.seeds):
         for contestant in contestants:
             path = folder / f"{key(contestant).replace('/', '-')}-{seed}.json"
-            if contestant.environment in pythons and (args.fresh or not made(path, contestant, args.budget_seconds)):
-                run = fly(contestant, pythons[contestant.environment], seed, args.budget_seconds, args.out / "cache")
-                say(run)
-                replace(path, json.dumps(run, indent=1) + "\n")
+            if contestant.environment in pythons and (
+                args.fresh or not is_current(path, contestant, args.budget_seconds)
+            ):
+                run = run_contestant(
+                    contestant, pythons[contestant.environment], seed, args.budget_seconds, args.out / "cache"
+                )
+                print_run(run)
+                files.replace_text(path, json.dumps(run, indent=1) + "\n")
         runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
-        tell(args.out, in_order(runs), absent)
+        write_report(args.out, in_order(runs), absent)
     print(f"{args.out}/bench.json, bench.md, bench.png")
 
 
 def installed(
     contestants: list[Contestant], peers: Path, folder: Path
 ) -> tuple[dict[str | None, Path], dict[str, str]]:
-    """The interpreters of the contestants' environments, and why some have none."""
+    """The interpreter of each environment, and the error of each that cannot be installed."""
     pythons: dict[str | None, Path] = {None: Path(sys.executable)}
     absent: dict[str, str] = {}
     for name in dict.fromkeys(c.environment for c in contestants if c.environment):
@@ -102,38 +107,38 @@ def installed(
     return pythons, absent
 
 
-def made(path: Path, contestant: Contestant, budget_seconds: float) -> bool:
-    """Whether this very run is there, of this machine, these versions and, if it is qrl's, this code; and did not fail.
+def is_current(path: Path, contestant: Contestant, budget_seconds: float) -> bool:
+    """Whether this run is there, did not fail, and is of this machine, these versions and, for qrl, this code.
 
-    Which commit's it is makes no difference: it says so, and so does the page.
+    The commit may differ; the page lists it.
     """
     if not path.exists():
         return False
     run = json.loads(path.read_text())
     same = run["command"] == command(contestant) and run["budget_seconds"] == budget_seconds
-    return same and run.get("circumstances") == circumstances(contestant) and run["outcome"] in FINISHED
+    return same and run.get("fingerprint") == run_fingerprint(contestant) and run["outcome"] in FINISHED
 
 
 def command(contestant: Contestant) -> list[str]:
     return [contestant.script, *contestant.words]
 
 
-def circumstances(contestant: Contestant) -> dict[str, Any]:
-    """What must be the same for a run to be like another: machine and versions; a peer's are its requirements, qrl's
-    the code that trains and its presets."""
+def run_fingerprint(contestant: Contestant) -> dict[str, Any]:
+    """What decides whether a run is current: machine and versions; for qrl the code that trains and its presets, for
+    others their requirements."""
     here = {name: value for name, value in machine().items() if name != "commit"}
     if contestant.environment is None:
         presets = json.dumps([load_preset(name) for name in preset_names()])
-        scripts = [PEERS / contestant.script, ROOT / "src" / "qrl" / "training" / "devices.py"]
+        scripts = [BASELINES / contestant.script, ROOT / "src" / "qrl" / "training" / "devices.py"]
         parts = [figure_runs.sha256(), presets, f"{contestant.devices}", *(path.read_text() for path in scripts)]
         return here | {"code": hashlib.sha256(json.dumps(parts).encode()).hexdigest()}
-    return here | {"requirements": fingerprint(PEERS / f"{contestant.environment}.txt")}
+    return here | {"requirements": fingerprint(BASELINES / f"{contestant.environment}.txt")}
 
 
-def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, cache: Path) -> Run:
-    """One run, in a process (and process group) of its own, ended where it goes on beyond its budget.
+def run_contestant(contestant: Contestant, python: Path, seed: int, budget_seconds: float, cache: Path) -> Run:
+    """One run in its own process group, killed at the end of its budget.
 
-    Nothing is compiled before its time is taken: rates alone, which leave compilation out, may use JAX's `cache`.
+    The compile cache is empty, except for rates, which exclude compilation and may use `cache`.
     """
     env = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_", "PJRT_", "NPROC", "PYTHON"))}
     env |= {
@@ -147,19 +152,19 @@ def fly(contestant: Contestant, python: Path, seed: int, budget_seconds: float, 
         env["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={contestant.devices}"
     if contestant.group == "speed":
         env["JAX_COMPILATION_CACHE_DIR"] = str(cache.absolute())
-    load = round(os.getloadavg()[0], 2)  # how quiet the machine was
-    script = [str(python), str(PEERS / contestant.script), *contestant.words, "--seed", str(seed)]
+    load = round(os.getloadavg()[0], 2)  # other work on the machine
+    script = [str(python), str(BASELINES / contestant.script), *contestant.words, "--seed", str(seed)]
     out, err, outcome = in_time(script, env, budget_seconds + GRACE_SECONDS)
     lines = [json.loads(line.removeprefix(MARK)) for line in out.splitlines() if line.startswith(MARK)]
-    said = (err.strip().splitlines() or [""])[-1][:300] if outcome.startswith("exit") else ""
+    error = (err.strip().splitlines() or [""])[-1][:300] if outcome.startswith("exit") else ""
     who = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
     how = {"command": command(contestant), "budget_seconds": budget_seconds, "commit": records.commit(), "load": load}
-    how["circumstances"] = circumstances(contestant)
-    return {**who, **how, "outcome": outcome, "said": said, "lines": lines}
+    how["fingerprint"] = run_fingerprint(contestant)
+    return {**who, **how, "outcome": outcome, "error": error, "lines": lines}
 
 
 def in_time(words: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:
-    """(standard output, standard error, how it ended) of a command in a folder of its own, where some leave things."""
+    """(standard output, standard error, how it ended) of a command in a temporary working directory."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -176,28 +181,33 @@ def in_time(words: list[str], env: dict[str, str], seconds: float) -> tuple[str,
             raise
 
 
-def say(run: Run) -> None:
+def print_run(run: Run) -> None:
     last = {k: round(v, 3) if isinstance(v, float) else v for k, v in (run["lines"] or [{}])[-1].items()}
-    print(f"{run['group']}/{run['contestant']}, seed {run['seed']}: {run['outcome']} {run['said']} {last}", flush=True)
+    print(
+        f"{run['group']}/{run['contestant']}, seed {run['seed']}: {run['outcome']} {run['error']} {last}",
+        flush=True,
+    )
 
 
 def in_order(runs: list[Run]) -> list[Run]:
-    """As the table of contestants has them; those that are there no more are left out."""
+    """In the order of CONTESTANTS, without runs of former contestants."""
     order = {(c.group, c.name): i for i, c in enumerate(CONTESTANTS)}
     known = [run for run in runs if (run["group"], run["contestant"]) in order]
     return sorted(known, key=lambda run: (order[run["group"], run["contestant"]], run["seed"]))
 
 
-def tell(out: Path, runs: list[Run], absent: dict[str, str]) -> None:
-    """The three files."""
+def write_report(out: Path, runs: list[Run], absent: dict[str, str]) -> None:
+    """Write bench.json, bench.md and bench.png."""
     here = machine()
-    replace(out / "bench.json", json.dumps({"machine": here, "absent": absent, "runs": runs}, indent=1) + "\n")
-    replace(out / "bench.md", page(runs, absent, here))
+    files.replace_text(
+        out / "bench.json", json.dumps({"machine": here, "absent": absent, "runs": runs}, indent=1) + "\n"
+    )
+    files.replace_text(out / "bench.md", page(runs, absent, here))
     plot(out / "bench.png", runs)
 
 
 def machine() -> dict[str, Any]:
-    """What the figures were taken on."""
+    """The machine of the figures."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         model = next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
@@ -209,12 +219,5 @@ def machine() -> dict[str, Any]:
     return {"CPU": model, "cores": cores, "Python": platform.python_version(), **versions}
 
 
-def replace(path: Path, text: str) -> None:
-    """Whole or not at all."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    temporary.write_text(text)
-    temporary.replace(path)
-
-
 if __name__ == "__main__":
-    run_to_the_end("bench", main)
+    run_main("bench", main)

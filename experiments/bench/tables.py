@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.bench.contestants import GROUPS, QRL
+from experiments.output import table
 
 Run = dict[str, Any]
 CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
@@ -19,14 +20,14 @@ EASIER_PENDULUM = -160.0  # at which the field's figures were taken
 TUNED = (
     "**Whose settings.** qrl races with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
     " `circle_fast`); its commands use the presets that ship as these tasks' defaults. On hover and circle these end"
-    " with the gradient of flights through the simulator (APG), which no peer here is given; a step so flown counts as"
-    " a step; *qrl without APG* is the same presets without it. qrl makes a device of each core, or has XLA use one"
+    " with the gradient of flights through the simulator (APG), which no other contestant here uses; such a step counts"
+    " as a step; *qrl without APG* is the same presets without it. qrl makes a device of each core, or has XLA use one"
     " thread where its minibatches are small, as `qrl train` does; every other contestant has the devices and threads"
     " that it chooses. Brax PPO's were tuned by hand for the pendulum, as"
     " Brax ships none that suit; on hover and circle it has the same with more lanes and a longer horizon, and no"
     " search was made there. rejax: its own for this task. sbx: the RL Zoo's for this task. rltools: the package's"
-    " defaults, made for this task. Rates: in a call qrl acts for 16,384 × 50 steps, or moves as many; a"
-    " peer makes an unroll."
+    " defaults, made for this task. Rates: in a call qrl acts for 16,384 × 50 steps, or moves as many;"
+    " another makes an unroll."
 )
 
 
@@ -45,12 +46,12 @@ def spread(values: Iterable[float]) -> Spread:
 
 
 def first_at(run: Run, name: str, bar: float) -> dict[str, float] | None:
-    """A run's first check at which `name` is at least `bar`; what is no number never is."""
+    """A run's first check at which `name` is at least `bar`; NaN never does."""
     return next((line for line in run["lines"] if line.get(name) is not None and line[name] >= bar), None)
 
 
 def to_solve(run: Run, clock: str, bar: float | None = None) -> float:
-    """What `clock` said when the run's task was solved; infinite if it never was."""
+    """The value of `clock` at which the run's task was solved; infinite if it never was."""
     name, usual = BARS[run["group"]]
     line = first_at(run, name, usual if bar is None else bar)
     return math.inf if line is None else float(line.get(clock, math.nan))
@@ -91,11 +92,6 @@ def by_seed(runs: list[Run], contestant: str, clock: str, bar: float | None = No
     return {run["seed"]: to_solve(run, clock, bar) for run in runs if run["contestant"] == contestant}
 
 
-def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 def race(runs: list[Run], group: str) -> str:
     """A group whose contestants train until they have solved the task."""
     name, bar = BARS[group]
@@ -111,7 +107,7 @@ def race(runs: list[Run], group: str) -> str:
             row.append("" if who == QRL else cell(ratios(by_seed(runs, who, clock), by_seed(runs, QRL, clock)), "×"))
         row += [cell(spread(by_seed(runs, who, "train_seconds", b).values())) for b in easier]
         rows.append(row)
-    return _table(head, rows)
+    return table(head, rows)
 
 
 def commands(runs: list[Run]) -> str:
@@ -119,7 +115,7 @@ def commands(runs: list[Run]) -> str:
     names = list(dict.fromkeys(name for run in runs for name in _last(run)))
     each = {who: [_last(run) for run in runs if run["contestant"] == who] for who in _names(runs)}
     rows = [[name.replace("_", " "), *(_of(lines, name) for lines in each.values())] for name in names]
-    return _table(["", *each], rows)
+    return table(["", *each], rows)
 
 
 def _last(run: Run) -> dict[str, float]:
@@ -132,8 +128,8 @@ def _of(lines: list[dict[str, float]], name: str) -> str:
 
 
 def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
-    """Of the group `speed`: figure -> contestant -> value by seed. How a contestant was told to run ("qrl, one device")
-    is the figure's part.
+    """Of the group `speed`: figure -> contestant -> value by seed. A number of devices in the
+    contestant's name ("qrl, one device") becomes part of the figure's name.
     """
     found: dict[str, dict[str, dict[int, float]]] = {}
     for run in runs:
@@ -146,49 +142,53 @@ def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
 
 
 def speed(runs: list[Run]) -> str:
-    """A row for each figure; what others reach is told with our rate over theirs, as we run by ourselves."""
+    """A row for each figure and contestant, with the ratio of qrl's rate at its default devices to it."""
     found, rows = figures(runs), []
     for figure, values in found.items():
-        ours = found.get(untold(figure), {}).get(QRL, {})
+        ours = found.get(strip_device_suffix(figure), {}).get(QRL, {})
         for who, theirs in values.items():
             ratio = None if who == QRL else ratios(ours, theirs)
             rows.append([figure, who, cell(spread(theirs.values())), cell(ratio, "×") if ratio else ""])
-    return _table(["", "", "a second, or seconds", "qrl / this"], rows)
+    return table(["", "", "a second, or seconds", "qrl / this"], rows)
 
 
-def untold(figure: str) -> str:
-    """Of whoever was not told how to run."""
+def strip_device_suffix(figure: str) -> str:
+    """The figure's name without its number of devices."""
     return figure.removesuffix(ONE_DEVICE).removesuffix(TWO_DEVICES)
 
 
 def derived(runs: list[Run]) -> str:
-    """What a contestant's rates say of each other: devices told over its own choice, and acting's cost by lanes."""
+    """Ratios within a contestant: given devices over its own choice, and the cost of acting by number of lanes."""
     found, rows = figures(runs), []
     for figure, values in found.items():
-        for who, told in values.items():
-            by_itself = found.get(untold(figure), {}).get(who, {})
+        for who, given in values.items():
+            by_itself = found.get(strip_device_suffix(figure), {}).get(who, {})
             if figure.endswith(TWO_DEVICES):
-                rows.append([f"{figure}, over its own choice", who, cell(ratios(told, by_itself), "×")])
+                rows.append([f"{figure}, over its own choice", who, cell(ratios(given, by_itself), "×")])
             elif figure.endswith(ONE_DEVICE):
                 rows.append(
-                    [f"{untold(figure)}, its own choice over one device", who, cell(ratios(by_itself, told), "×")]
+                    [
+                        f"{strip_device_suffix(figure)}, its own choice over one device",
+                        who,
+                        cell(ratios(by_itself, given), "×"),
+                    ]
                 )
     acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
     for who in dict.fromkeys(who for values in acting for who in values):
         each = [values[who] for values in acting if who in values]
         seeds = set.intersection(*(set(rates) for rates in each))
         most, least = ({s: f(rates[s] for rates in each) for s in sorted(seeds)} for f in (max, min))
-        told = f"acting, a step's cost at the dearest of {len(each)} numbers of lanes over the cheapest"
-        rows.append([told, who, cell(ratios(most, least), "×")])
-    return _table(["", "", "ratio"], rows) if rows else ""
+        label = f"acting, a step's cost at the dearest of {len(each)} numbers of lanes over the cheapest"
+        rows.append([label, who, cell(ratios(most, least), "×")])
+    return table(["", "", "ratio"], rows) if rows else ""
 
 
 def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> str:
     """bench.md."""
-    said = "; ".join(f"{name} {value}" for name, value in machine.items())
-    parts = ["# qrl beside its peers", f"{said}."]
+    described = "; ".join(f"{name} {value}" for name, value in machine.items())
+    parts = ["# qrl beside other trainers and simulators", f"{described}."]
     if len(commits := sorted({run["commit"] for run in runs if "commit" in run})) > 1:
-        parts.append(f"**Runs of several commits**: {', '.join(commits)}. `--fresh` makes all anew.")
+        parts.append(f"**Runs of several commits**: {', '.join(commits)}. `--fresh` repeats all.")
     parts.append(
         "Median [least … greatest] over seeds. A ratio is formed of runs made one after the other, seed by seed, and"
         " then spread likewise. *not*: most runs did not solve it within their budget."
@@ -204,9 +204,9 @@ def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> st
                 parts.append(more)
     broken = [run for run in runs if run["outcome"] not in ("done", "out of time")]
     if absent or broken:
-        told = [f"- {name}: not installed: {why}" for name, why in absent.items()]
-        told += [
-            f"- {r['group']}/{r['contestant']}, seed {r['seed']}: {r['outcome']}: {r.get('said', '')}" for r in broken
+        problems = [f"- {name}: not installed: {why}" for name, why in absent.items()]
+        problems += [
+            f"- {r['group']}/{r['contestant']}, seed {r['seed']}: {r['outcome']}: {r.get('error', '')}" for r in broken
         ]
-        parts += ["## Absent, or failed", "\n".join(told)]
+        parts += ["## Absent, or failed", "\n".join(problems)]
     return "\n\n".join(parts) + "\n"

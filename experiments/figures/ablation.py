@@ -2,8 +2,8 @@
 
     .venv/bin/python -m experiments.figures.ablation [--out experiments/out] [--only pendulum] [--fresh]
 
-Runs `qrl sweep` on experiments/grids/ablation_TASK.json into OUT/ablation/TASK and writes OUT/ablation.md. What
-is finished and current is kept; an interrupted sweep goes on.
+Runs `qrl sweep` on experiments/grids/ablation_TASK.json into OUT/ablation/TASK and writes OUT/ablation.md. A finished
+sweep of the same code is kept; an interrupted one is resumed.
 """
 
 import csv
@@ -16,14 +16,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.arguments import Parser, run_to_the_end
+from experiments.arguments import Parser, run_main
 from experiments.figures import runs as figure_runs
 from experiments.figures.runs import CODE, ROOT, Failed
+from experiments.output import table
 from qrl.config import load_preset
 from qrl.runs import files, record
 
 TASKS = ("pendulum", "hover")
-# What each row is. One of a grid that is not here is an error: a table must say what it compares.
+# What each row is. A grid's objective that is not here is an error.
 ROWS = {
     "ours": "the paper's choice: condition 4, (π/μ − 1)·A^π ≥ ε|A^π|, A^π by V-trace, replayed trajectories",
     "condition 3": "(π − μ)·A^π in the ratio's place; ε|A| is then a margin of densities, not of ratios",
@@ -48,11 +49,10 @@ class Row(NamedTuple):
 def main(argv: list[str] | None = None) -> int:
     parser = Parser("ablation", __doc__)
     parser.add_argument("--out", type=Path, default=Path("experiments/out"), metavar="FOLDER")
-    parser.add_argument("--only", choices=TASKS, help="one task alone")
-    parser.add_argument("--fresh", action="store_true", help="make the sweeps again")
+    parser.add_argument("--only", choices=TASKS, help="one task only")
+    parser.add_argument("--fresh", action="store_true", help="run the sweeps again")
     args = parser.parse_args(argv)
-    if args.out.exists() and not args.out.is_dir():
-        parser.error(f"--out: {args.out} is a file; expected a folder, or a name for a new one")
+    parser.check_folder("--out", args.out)
     tasks = [args.only] if args.only else TASKS
     try:
         for task in tasks:
@@ -71,7 +71,7 @@ def grid(task: str) -> Path:
 
 
 def sweep(path: Path, out: Path, *, fresh: bool) -> None:
-    """See to it that `out` holds this grid's sweep, of this code and these versions."""
+    """Run the grid's sweep into `out` unless it is there, finished, of this code and these versions."""
     if fresh or not (out / CODE).exists() or (out / CODE).read_text() != stamp(path):
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
@@ -80,7 +80,7 @@ def sweep(path: Path, out: Path, *, fresh: bool) -> None:
 
 
 def stamp(path: Path) -> str:
-    """What tells whether a sweep of the grid at `path` is current."""
+    """A hash of all that decides the results of the grid at `path`."""
     versions = {name: version for name, version in record.versions().items() if name not in ("commit", "qrl")}
     deciding = [json.loads(path.read_text()), versions, figure_runs.sha256()]
     return hashlib.sha256(json.dumps(deciding, sort_keys=True).encode()).hexdigest()
@@ -93,29 +93,26 @@ def rows(out: Path) -> dict[str, Row]:
     found = {}
     for name in dict.fromkeys(line["objective"] for line in lines):
         mine = [line for line in lines if line["objective"] == name]
-        sick = [bool(line["diverged"]) for line in mine]
-        returns = [-np.inf if ill else float(line["return_mean"]) for ill, line in zip(sick, mine, strict=True)]
-        success = [0.0 if ill else float(line["success"] or "nan") for ill, line in zip(sick, mine, strict=True)]
-        found[name] = Row(np.array(returns), np.array(success), sum(sick))
+        diverged = [bool(line["diverged"]) for line in mine]
+        returns = [-np.inf if bad else float(line["return_mean"]) for bad, line in zip(diverged, mine, strict=True)]
+        success = [0.0 if bad else float(line["success"] or "nan") for bad, line in zip(diverged, mine, strict=True)]
+        found[name] = Row(np.array(returns), np.array(success), sum(diverged))
     return found
 
 
 def page(found: dict[str, dict[str, Row]]) -> str:
-    """The table as Markdown; `found`: task -> objective -> row."""
-    names = list(dict.fromkeys(name for table in found.values() for name in table))
+    """The table as Markdown; `found` maps task -> objective -> row."""
+    names = list(dict.fromkeys(name for task in found.values() for name in task))
     heads = [f"{task}: {what}" for task in found for what in ("return", "success, %")]
-    lines = ["# The paper's objectives side by side", "", "| objective | " + " | ".join(heads) + " |"]
-    lines.append("|---" * (1 + len(heads)) + "|")
-    for name in names:
-        cells = [cell for table in found.values() for cell in cells_of(table.get(name))]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    cells = [[name, *(cell for task in found.values() for cell in cells_of(task.get(name)))] for name in names]
+    lines = ["# The paper's objectives side by side", "", table(["objective", *heads], cells)]
     lines += ["", *(f"- *{name}*: {ROWS[name]}." for name in names), ""]
     for task in found:
         file = json.loads(grid(task).read_text())
         steps = file["fixed"].get("num_timesteps") or load_preset(task)["num_timesteps"]
         lines.append(
-            f"{task}: {steps:,} steps, {file['seeds']} seeds, `qrl sweep experiments/{grid(task).name}`, flown from"
-            " the starts of a run's reports after the last step."
+            f"{task}: {steps:,} steps, {file['seeds']} seeds, `qrl sweep experiments/grids/{grid(task).name}`,"
+            " evaluated from the starts of a run's reports after the last step."
         )
     versions = ", ".join(f"{name} {version}" for name, version in record.versions().items())
     return "\n".join([*lines, "", f"Median [least … most] over seeds. Versions: {versions}.", ""])
@@ -124,8 +121,8 @@ def page(found: dict[str, dict[str, Row]]) -> str:
 def cells_of(row: Row | None) -> tuple[str, str]:
     if row is None:
         return "–", "–"
-    sick = f"; {row.diverged} of {len(row.returns)} diverged" if row.diverged else ""
-    return spread(row.returns) + sick, spread(100.0 * row.success, ".0f")
+    diverged = f"; {row.diverged} of {len(row.returns)} diverged" if row.diverged else ""
+    return spread(row.returns) + diverged, spread(100.0 * row.success, ".0f")
 
 
 def spread(values: Any, form: str = ".1f") -> str:
@@ -136,4 +133,4 @@ def spread(values: Any, form: str = ".1f") -> str:
 
 
 if __name__ == "__main__":
-    run_to_the_end("ablation", main)
+    run_main("ablation", main)

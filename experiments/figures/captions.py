@@ -1,4 +1,4 @@
-"""What stands beside each figure: how it was made, the paper's claim, what was measured, and a verdict.
+"""The caption of each figure: how it was made, the paper's claim, what was measured, and a verdict.
 
 Every number here is computed from the runs. The rule of each verdict is in its caption.
 """
@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.figures.flights import Flown
+from experiments.figures.flights import PolicyFlights
 from experiments.figures.plots import PUBLISHED, Curves, Rate, thousands
-from experiments.figures.runs import PAPER_RATES, Wanted
+from experiments.figures.runs import PAPER_RATES, RunSpec
 from qrl import tasks
 from qrl.runs.record import RunConfig
 from qrl_envs.perturbations import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
@@ -35,20 +35,21 @@ class Caption(NamedTuple):
     verdict: str
 
 
-class Made(NamedTuple):
-    """What a caption says of how its figure was made."""
+class Provenance(NamedTuple):
+    """What a caption says of how its figure was provenance."""
 
     command: str
     commit: str  # of the code that drew it
     note: str  # "" or a sentence
-    runs: Sequence[tuple[Wanted, Path]]
+    runs: Sequence[tuple[RunSpec, Path]]
 
 
-def page(caption: Caption, made: Made) -> str:
+def page(caption: Caption, provenance: Provenance) -> str:
     """The caption as Markdown."""
-    configs = {one.name: tasks.load_run_config(folder) for one, folder in made.runs}
+    configs = {one.name: tasks.load_run_config(folder) for one, folder in provenance.runs}
     commands = [
-        f"- `{one.name}`: `{_command(one, configs[one.name])}`, {_seeds(configs[one.name])}" for one, _ in made.runs
+        f"- `{one.name}`: `{_command(one, configs[one.name])}`, {_seeds(configs[one.name])}"
+        for one, _ in provenance.runs
     ]
     versions = {tuple(config.versions.items()) for config in configs.values()}
     said = [", ".join(f"{name} {version}" for name, version in one) for one in sorted(versions)]
@@ -68,7 +69,7 @@ def page(caption: Caption, made: Made) -> str:
             "",
             "## How it was made",
             "",
-            f"`{made.command}` at commit {made.commit}{made.note}, from these runs:",
+            f"`{provenance.command}` at commit {provenance.commit}{provenance.note}, from these runs:",
             "",
             *commands,
             "",
@@ -78,8 +79,8 @@ def page(caption: Caption, made: Made) -> str:
     )
 
 
-def _command(one: Wanted, config: RunConfig) -> str:
-    """As it was run: results agree only to rounding on another number of devices."""
+def _command(one: RunSpec, config: RunConfig) -> str:
+    """The command with its number of devices: on another number results agree only to rounding."""
     cpu = any("cpu" in device.lower() for device in config.devices)
     before = f"JAX_NUM_CPU_DEVICES={len(config.devices)} " if cpu else ""
     return f"{before}qrl {' '.join(one.words)}"
@@ -89,7 +90,7 @@ def _seeds(config: RunConfig) -> str:
     return f"seed {config.seed}" if config.seeds == 1 else f"seeds {config.seed}–{config.seed + config.seeds - 1}"
 
 
-def told(values: np.ndarray, form: str = ".1f") -> str:
+def format_quartiles(values: np.ndarray, form: str = ".1f") -> str:
     """Median and quartiles over seeds."""
     low, median, high = np.nanquantile(values, (0.25, 0.5, 0.75))
     return f"{median:{form}} [{low:{form}} … {high:{form}}]"
@@ -110,7 +111,7 @@ def pendulum(rates: list[Rate]) -> Caption:
         if rate.title not in idle:
             verdicts.append(EXCEEDED if all_better else CONFIRMED if better else NOT)
         said = "ours, every seed" if all_better else "ours, by the median" if better else "not ours"
-        lines.append(f"| {rate.title} | {told(ours)} | {told(ppo)} | {said} |")
+        lines.append(f"| {rate.title} | {format_quartiles(ours)} | {format_quartiles(ppo)} | {said} |")
     if idle:
         lines += ["", f"Within these steps hardly anything is learnt by either at: {'; '.join(idle)}."]
     high, low = PAPER_RATES["high"], PAPER_RATES["low"]
@@ -149,8 +150,8 @@ def hover(curves: Curves) -> Caption:
         f"{thousands(PAPER_HOVER_STEPS)} time steps are enough for a policy that hovers steadily (two runs).",
         [
             *_solved_lines(curves, solved),
-            f"- At the end, {thousands(curves.steps[-1])} steps: return {told(last)}, success"
-            f" {told(100 * success, '.0f')} %. The published checkpoints reach {PUBLISHED[-1][1]:g} at"
+            f"- At the end, {thousands(curves.steps[-1])} steps: return {format_quartiles(last)}, success"
+            f" {format_quartiles(100 * success, '.0f')} %. The published checkpoints reach {PUBLISHED[-1][1]:g} at"
             f" {thousands(PUBLISHED[-1][0])}.",
         ],
         f"Hovering steadily: from {SOLVED:.0%} of a report's starts or more, within 0.1 m throughout the last 2 s, in"
@@ -182,8 +183,8 @@ def circle(curves: Curves, episode_steps: int) -> Caption:
             *_solved_lines(curves, solved),
             f"- In the paper's episodes of {PAPER_EPISODE_STEPS} steps that is {_counts(episodes)}; episodes here are"
             f" of up to {episode_steps} steps.",
-            f"- At the end, {thousands(curves.steps[-1])} steps: return {told(curves.returns[:, -1])}, success"
-            f" {told(100 * curves.success[:, -1], '.0f')} %.",
+            f"- At the end, {thousands(curves.steps[-1])} steps: return {format_quartiles(curves.returns[:, -1])},"
+            f" success {format_quartiles(100 * curves.success[:, -1], '.0f')} %.",
         ],
         f"Flying the circle: from {SOLVED:.0%} of a report's starts or more, within 0.1 m of it and 0.2 m/s of 2 m/s"
         f" throughout the last 4 s, in that report and all later ones. Confirmed: the median seed does by"
@@ -218,16 +219,16 @@ def _counts(values: np.ndarray) -> str:
 # Flights
 
 
-def trial(flown: Flown) -> Caption:
+def trial(flown: PolicyFlights) -> Caption:
     share, settle = float(flown.measures["success"].mean()), flown.measures["settle_s"]
     worked = bool(flown.measures["success"][0])
     position, velocity = (", ".join(f"{x:g}" for x in triple) for triple in (TRIAL_POSITION_M, TRIAL_VELOCITY_M_S))
     return Caption(
         "Hover: x, y and z of the paper's trial",
         f"Position over time from [{position}] m at [{velocity}] m/s, deterministic policy of seed {flown.seed} after"
-        f" {flown.env_steps:,} steps. The paper does not tell the attitude: the thick lines' is the first start's of"
-        f" `make evaluate`, as are the body rates; the thin ones' are those of the next four (one that flees leaves the"
-        f" window). In training no start is faster than {flown.task.start.velocity_m_s:g} m/s on any axis.",
+        f" {flown.env_steps:,} steps. The paper does not give the attitude: the thick lines' is the first start's of"
+        f" `make evaluate`, as are the body rates; the thin ones' are those of the next four (a diverging one leaves"
+        f" the window). In training no start is faster than {flown.task.start.velocity_m_s:g} m/s on any axis.",
         "From this start the vehicle comes to the origin and stays there.",
         [
             f"- The flight drawn thick {_settles(settle[0])} within {flown.task.evaluation.distance_m:g} m;"
@@ -242,7 +243,7 @@ def trial(flown: Flown) -> Caption:
     )
 
 
-def from_above(flown: Flown, shown: int) -> Caption:
+def from_above(flown: PolicyFlights, shown: int) -> Caption:
     success = flown.measures["success"]
     rms = flown.measures["rms_radius_m"][:shown]
     count = int(success[:shown].sum())
@@ -267,7 +268,7 @@ def from_above(flown: Flown, shown: int) -> Caption:
     )
 
 
-def velocity(flown: Flown) -> Caption:
+def velocity(flown: PolicyFlights) -> Caption:
     amplitudes, rest, frequency = harmonic(flown)
     wanted = _wanted(flown)
     tail = flown.observations[0, -_tail(flown) :, 12:14]
@@ -287,7 +288,7 @@ def velocity(flown: Flown) -> Caption:
     )
 
 
-def harmonic(flown: Flown) -> tuple[np.ndarray, float, float]:
+def harmonic(flown: PolicyFlights) -> tuple[np.ndarray, float, float]:
     """Amplitudes [2] [m/s] of the sinusoids fitted to vx and vy over the first flight's tail, the RMS [m/s] of what
     they leave, and their angular frequency [rad/s], at which the velocity turns there on average."""
     n = _tail(flown)
@@ -300,11 +301,11 @@ def harmonic(flown: Flown) -> tuple[np.ndarray, float, float]:
     return np.hypot(*fit), float(np.sqrt(np.mean((v - basis @ fit) ** 2))), frequency
 
 
-def _tail(flown: Flown) -> int:
+def _tail(flown: PolicyFlights) -> int:
     return round(flown.task.evaluation.tail_s / flown.task.control_period_s) + 1
 
 
-def _wanted(flown: Flown) -> CircleReward:
+def _wanted(flown: PolicyFlights) -> CircleReward:
     wanted = flown.task.evaluation.reward
     assert isinstance(wanted, CircleReward)
     return wanted

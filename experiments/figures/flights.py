@@ -13,13 +13,13 @@ from qrl_envs.perturbations import OffNominal, conditions
 from qrl_envs.task import QuadrotorTask
 
 
-class Flown(NamedTuple):
+class PolicyFlights(NamedTuple):
     """Flights of one policy, SI units."""
 
     seed: int
-    env_steps: int  # after so many of training
+    env_steps: int  # of training
     task: QuadrotorTask
-    observations: np.ndarray  # [n, K + 1, 18] at times 0, dt, … K·dt; NaN from where one ended early
+    observations: np.ndarray  # [n, K + 1, 18] at times 0, dt, … K·dt; NaN after an early end
     measures: dict[str, np.ndarray]  # of measures.py -> [n]
 
     @property
@@ -27,11 +27,11 @@ class Flown(NamedTuple):
         return np.arange(self.observations.shape[1]) * self.task.control_period_s
 
 
-def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
+def fly_policy(folder: Path, *, trial: bool = False, starts: int = STARTS) -> PolicyFlights:
     """The last policy of a run's first seed, from the first starts of `make evaluate`.
 
-    With `trial` position and velocity at the start are the paper's trial's; attitude, of which the paper does not tell,
-    and body rates remain the start's own. BadInput or OSError, in a line, where the run cannot be read.
+    With `trial`, the initial position and velocity are those of the paper's trial; attitude, which the paper does not
+    give, and body rates are those of the start. Raises BadInput or OSError where the run cannot be read.
     """
     run = TrainedRun.load(record.member_folders(folder, tasks.load_run_config(folder))[0])
     task = run.task
@@ -39,4 +39,4 @@ def flown(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Flown:
     env = OffNominal(task, conditions(task)["trial"]) if trial else None
     flights = run.fly(evaluation_starts()[:starts], env)
     measures = {name: np.asarray(value) for name, value in flights.measures.items()}
-    return Flown(run.config.seed, run.env_steps, task, np.asarray(flights.observations), measures)
+    return PolicyFlights(run.config.seed, run.env_steps, task, np.asarray(flights.observations), measures)

@@ -1,9 +1,9 @@
-"""The paper's six figures from runs of this code, each with a caption: `make figures`, or `make figures FAST=1`.
+"""The paper's six figures from runs of this code, with captions: `make figures`, or `make figures FAST=1`.
 
     .venv/bin/python -m experiments.figures.make [--fast] [--out FOLDER] [--only pendulum hover …] [--fresh]
 
-Leaves NAME.png, NAME.svg and NAME.md for each figure, and the runs in OUT/runs. A run is made as a user would make it
-(`qrl train`), one at a time; one that is finished and current is kept, an unfinished one gone on with.
+Leaves NAME.png, NAME.svg and NAME.md for each figure, and the runs in OUT/runs. Runs are trained by `qrl train`, one
+at a time; a finished run of the same code is kept, an unfinished one is resumed.
 """
 
 import functools
@@ -17,20 +17,21 @@ from typing import NamedTuple
 import jax
 from matplotlib.figure import Figure
 
-from experiments.arguments import Parser, run_to_the_end
+from experiments.arguments import Parser, run_main
 from experiments.figures import captions
 from experiments.figures import plots as draw
-from experiments.figures.captions import Caption, Made
-from experiments.figures.flights import Flown, flown
+from experiments.figures.captions import Caption, Provenance
+from experiments.figures.flights import PolicyFlights, fly_policy
 from experiments.figures.plots import SHOWN, Curves, Rate
-from experiments.figures.runs import PAPER_RATES, Failed, Wanted, current, make, reports, wanted
+from experiments.figures.runs import PAPER_RATES, Failed, RunSpec, is_current, reports, train
+from experiments.figures.runs import plan as planned
 from qrl import tasks
 from qrl.algorithm.adapter import adapt
 from qrl.cli.terminal import DONE, FAILED
 from qrl.runs import files, record
 from qrl_envs.specfile import BadInput, nearest
 
-FIGURES = {  # name -> the beginnings of the names of its runs; of several the first that there is
+FIGURES = {  # name -> the beginnings of the names of its runs; the first that exists
     "pendulum": ("pendulum-",),
     "hover": ("hover",),
     "hover_trial": ("hover-flight", "hover"),
@@ -39,12 +40,13 @@ FIGURES = {  # name -> the beginnings of the names of its runs; of several the f
     "circle_velocity": ("circle-flight", "circle"),
 }
 OUT = Path("experiments/out/figures")
+COMMAND = ("python", "-m", "experiments.figures.make")
 
 
 class Source(NamedTuple):
-    """A run that is there, and its folder."""
+    """A run and its folder."""
 
-    run: Wanted
+    run: RunSpec
     folder: Path
 
 
@@ -54,15 +56,14 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--fast", action="store_true", help="shorter runs, fewer seeds")
     parser.add_argument("--out", type=Path, help=f"({OUT}; with --fast {OUT}_fast)", metavar="FOLDER")
     parser.add_argument("--only", nargs="+", default=list(FIGURES), help=", ".join(FIGURES), metavar="NAME")
-    parser.add_argument("--fresh", action="store_true", help="make the runs again")
+    parser.add_argument("--fresh", action="store_true", help="train all runs again")
     args = parser.parse_args(words)
     for name in args.only:
         if name not in FIGURES:
             parser.error(f"--only: no figure '{name}'{nearest(name, list(FIGURES))}")
     out: Path = args.out or (OUT.with_name(f"{OUT.name}_fast") if args.fast else OUT)
-    if out.exists() and not out.is_dir():
-        parser.error(f"--out: {out} is a file; expected a folder, or a name for a new one")
-    command = shlex.join(["experiments/figures/make.py", *words]) if words not in ([], ["--fast"]) else "make figures"
+    parser.check_folder("--out", out)
+    command = "make figures" if words in ([], ["--fast"]) else shlex.join([*COMMAND, *words])
     try:
         figures(args.only, out, command + " FAST=1" * (words == ["--fast"]), fast=args.fast, fresh=args.fresh)
     except (OSError, Failed, BadInput) as error:
@@ -73,26 +74,28 @@ def main(argv: list[str] | None = None) -> int:
 
 def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: bool) -> dict[str, Caption]:
     """Each figure as soon as its runs are there; their captions."""
-    begun = time.perf_counter()
-    plan, there, told = wanted(fast=fast), set[str](), dict[str, Caption]()
-    fly = functools.cache(flown)
+    start = time.perf_counter()
+    plan, there, found = planned(fast=fast), set[str](), dict[str, Caption]()
+    fly = functools.cache(fly_policy)
     note = " (FAST: shorter runs and fewer seeds than those of `make figures`)" if fast else ""
     for name in names:
         sources = [Source(run, out / "runs" / run.name) for run in needed(name, plan)]
         for run, folder in sources:
             if run.name not in there:
-                obtain(run, folder, fresh=fresh)
+                ensure_run(run, folder, fresh=fresh)
                 there.add(run.name)
-        figure, caption = drawn(name, sources, fly)
-        told[name] = caption
+        figure, caption = draw_figure(name, sources, fly)
+        found[name] = caption
         draw.save(figure, out / name)
-        files.replace_text(out / f"{name}.md", captions.page(caption, Made(command, record.commit(), note, sources)))
+        files.replace_text(
+            out / f"{name}.md", captions.page(caption, Provenance(command, record.commit(), note, sources))
+        )
         print(f"figures: {out / name}.png, .svg, .md: {caption.verdict}", flush=True)
-    print(f"figures: done in {time.perf_counter() - begun:.0f} s", flush=True)
-    return told
+    print(f"figures: done in {time.perf_counter() - start:.0f} s", flush=True)
+    return found
 
 
-def needed(name: str, plan: list[Wanted]) -> list[Wanted]:
+def needed(name: str, plan: list[RunSpec]) -> list[RunSpec]:
     """The runs of `plan` that the figure `name` is drawn from."""
     for beginning in FIGURES[name]:
         many = beginning.endswith("-")
@@ -101,18 +104,20 @@ def needed(name: str, plan: list[Wanted]) -> list[Wanted]:
     raise AssertionError(name)
 
 
-def obtain(run: Wanted, folder: Path, *, fresh: bool) -> None:
-    """See to it that the run is there and current."""
+def ensure_run(run: RunSpec, folder: Path, *, fresh: bool) -> None:
+    """Train the run unless it is current."""
     if fresh:
         shutil.rmtree(folder, ignore_errors=True)
-    if current(folder, run.config()):
+    if is_current(folder, run.config()):
         print(f"figures: {folder}: current", flush=True)
         return
     print(f"figures: qrl {' '.join(run.words)}", flush=True)
-    print(f"figures: {folder}: made in {make(run, folder):.0f} s", flush=True)
+    print(f"figures: {folder}: trained in {train(run, folder):.0f} s", flush=True)
 
 
-def drawn(name: str, sources: list[Source], fly: "functools._lru_cache_wrapper[Flown]") -> tuple[Figure, Caption]:
+def draw_figure(
+    name: str, sources: list[Source], fly: "functools._lru_cache_wrapper[PolicyFlights]"
+) -> tuple[Figure, Caption]:
     first = sources[0].folder
     if name == "pendulum":
         found = rates(sources)
@@ -156,4 +161,4 @@ def rates(sources: list[Source]) -> list[Rate]:
 
 if __name__ == "__main__":
     jax.config.update("jax_platforms", "cpu")  # a GPU is the runs'
-    run_to_the_end("figures", main)
+    run_main("figures", main)

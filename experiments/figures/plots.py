@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,14 +13,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from experiments.figures.flights import Flown
+from experiments.figures.flights import PolicyFlights
+from experiments.output import atomic_write
 from qrl_envs.plots.frame import COLOURS, INK
 from qrl_envs.task import CircleReward
 
 WIDTH_IN = 3.4  # a column
 PIXELS_PER_INCH = 200
 POINTS = 8.0  # the least size of a letter
-DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # colour is never all that tells lines apart
+DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # lines differ in dash as well as color
 PUBLISHED = ((2e6, 151.0), (3e6, 158.0), (5e6, 160.6), (10e6, 162.9))  # authors' checkpoints, flown: steps, return
 SHOWN = 5
 
@@ -76,18 +78,19 @@ def quartiles(values: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def style() -> Iterator[None]:
-    """What figures are made and saved under."""
+    """Matplotlib's settings for creating and saving figures."""
     with matplotlib.rc_context(_STYLE):  # pyright: ignore[reportArgumentType]  of literals alone
         yield
 
 
 def save(figure: Figure, path: Path) -> None:
-    """As PNG and SVG beside each other, each whole or not at all; `path` without a suffix."""
+    """Write PATH.png and PATH.svg, each atomically; `path` has no suffix."""
     with style():
         for form, metadata in (("png", None), ("svg", {"Date": None})):
-            temporary = path.with_name(f"{path.name}.{form}.tmp")
-            figure.savefig(temporary, format=form, dpi=PIXELS_PER_INCH, metadata=metadata)
-            temporary.replace(path.with_name(f"{path.name}.{form}"))
+            atomic_write(
+                path.with_name(f"{path.name}.{form}"),
+                partial(figure.savefig, format=form, dpi=PIXELS_PER_INCH, metadata=metadata),
+            )
 
 
 def _figure(height_in: float, rows: int = 1, **more: Any) -> tuple[Figure, list[Axes]]:
@@ -107,10 +110,10 @@ def pendulum(rates: list[Rate]) -> Figure:
     with style():
         figure, panels = _figure(0.4 + 2.2 * len(groups), len(groups), sharex=True, sharey=True)
         for axes, (title, pair) in zip(panels, groups.items(), strict=True):
-            colours = iter(COLOURS)
+            colors = iter(COLOURS)
             for rate in pair:
                 for curves, dash in ((rate.ours, DASHES[0]), (rate.ppo, DASHES[1])):
-                    _draw(axes, curves.steps, curves.returns, next(colours), dash, curves.label)
+                    _draw(axes, curves.steps, curves.returns, next(colors), dash, curves.label)
             axes.set(ylabel="return of 200 steps [1]")
             axes.legend(title=title, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, labelspacing=0.25)
         _steps(panels[-1])
@@ -145,11 +148,11 @@ def circle(curves: Curves) -> Figure:
         return figure
 
 
-def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, colour: str, dash: Any, label: str) -> None:
+def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, dash: Any, label: str) -> None:
     """The median of `values` [seeds, x] and the band between their quartiles."""
     low, median, high = quartiles(values)
-    axes.fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
-    axes.plot(steps, median, color=colour, linestyle=dash, label=label)
+    axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+    axes.plot(steps, median, color=color, linestyle=dash, label=label)
 
 
 def _share(axes: Axes, curves: Curves) -> None:
@@ -158,7 +161,7 @@ def _share(axes: Axes, curves: Curves) -> None:
 
 
 def _floor(values: np.ndarray) -> float:
-    """Of an axis for `values` [seeds, x]: from where the median's first third on it is seen whole."""
+    """Of an axis for `values` [seeds, x]: low enough to show the median after its first sixth."""
     median = quartiles(values)[1]
     return float(np.nanmin(median[len(median) // 6 :])) - 10.0
 
@@ -179,7 +182,7 @@ def thousands(value: float) -> str:
 # Flights
 
 
-def trial(flown: Flown) -> Figure:
+def trial(flown: PolicyFlights) -> Figure:
     """x, y and z of the first flight over time, thin behind them those of the next."""
     with style():
         figure, (axes,) = _figure(2.3)
@@ -188,7 +191,7 @@ def trial(flown: Flown) -> Figure:
             for other in others:
                 axes.plot(flown.times_s, other, color=COLOURS[i], linewidth=0.7, alpha=0.35)
             axes.plot(flown.times_s, first, color=COLOURS[i], linestyle=dash, label=name, zorder=3)
-        # The thick lines whole, beneath the legend; a flight that flees leaves the window.
+        # All of the thick lines, beneath the legend; a diverging flight leaves the window.
         drawn = flown.observations[0, :, 9:12]
         low, high = np.nanmin(drawn), np.nanmax(drawn)
         limits = low - 0.2 * (high - low), high + 0.3 * (high - low)
@@ -197,15 +200,15 @@ def trial(flown: Flown) -> Figure:
         return figure
 
 
-def from_above(flown: Flown) -> Figure:
-    """Paths of the first five flights on the x-y plane, and the circle that they should fly."""
+def from_above(flown: PolicyFlights) -> Figure:
+    """Paths of the first five flights on the x-y plane, and the reference circle."""
     with style():
         figure, (axes,) = _figure(3.5)
         angle, r = np.linspace(0.0, 2.0 * np.pi, 181), _wanted(flown).radius_m
         x, y = r * np.cos(angle), r * np.sin(angle)
-        for colour, path in zip(COLOURS, flown.observations[:SHOWN, :, 9:11], strict=False):
-            axes.plot(*path.T, color=colour, linewidth=1.0)
-            axes.plot(*path[0], "o", color=colour, markeredgecolor="white", markersize=6, zorder=4)
+        for color, path in zip(COLOURS, flown.observations[:SHOWN, :, 9:11], strict=False):
+            axes.plot(*path.T, color=color, linewidth=1.0)
+            axes.plot(*path[0], "o", color=color, markeredgecolor="white", markersize=6, zorder=4)
         axes.plot([], [], "o", color=INK, markersize=5, label="start")
         axes.plot(x, y, "--", color="black", linewidth=1.2, zorder=5, label=f"{r:g} m reference")
         paths = flown.observations[:SHOWN, :, 9:11]
@@ -215,8 +218,8 @@ def from_above(flown: Flown) -> Figure:
         return figure
 
 
-def velocity(flown: Flown) -> Figure:
-    """vx and vy of the first flight over time, and ± the speed that it should have."""
+def velocity(flown: PolicyFlights) -> Figure:
+    """vx and vy of the first flight over time, and ± the reference speed."""
     with style():
         figure, (axes,) = _figure(2.3)
         wanted = _wanted(flown).speed_m_s
@@ -230,7 +233,7 @@ def velocity(flown: Flown) -> Figure:
         return figure
 
 
-def _wanted(flown: Flown) -> CircleReward:
+def _wanted(flown: PolicyFlights) -> CircleReward:
     wanted = flown.task.evaluation.reward
     assert isinstance(wanted, CircleReward)
     return wanted

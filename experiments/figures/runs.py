@@ -33,7 +33,7 @@ class Failed(RuntimeError):
     """A run ended with an error; the message says which, in a line."""
 
 
-class Wanted(NamedTuple):
+class RunSpec(NamedTuple):
     """A run that a figure needs; its folder is named so."""
 
     name: str
@@ -41,40 +41,42 @@ class Wanted(NamedTuple):
     preset: str  # whose values the flags are laid over
     flags: dict[str, Any]  # of `qrl train`, by the names of qrl.config
     seeds: int = 1
+    seed: int = 0
 
     @property
     def words(self) -> list[str]:
         """The command, but for its --out."""
         preset = [] if self.preset == self.task else ["--preset", self.preset]
         flags = [word for name, value in self.flags.items() for word in (f"--{name.replace('_', '-')}", f"{value}")]
-        return ["train", self.task, "--seeds", str(self.seeds), *preset, *flags]
+        seed = ["--seed", str(self.seed)] * bool(self.seed)
+        return ["train", self.task, *seed, "--seeds", str(self.seeds), *preset, *flags]
 
     def config(self) -> RunConfig:
         """What its config.json says if it is made now."""
         file = ConfigFile(learner=tasks.preset(self.preset, self.name))
-        return request.run_config(self.task, None, file, self.flags, 0, self.seeds)
+        return request.run_config(self.task, None, file, self.flags, self.seed, self.seeds)
 
 
-def wanted(*, fast: bool) -> list[Wanted]:
+def plan(*, fast: bool) -> list[RunSpec]:
     """All runs, the quickest tasks first."""
     seeds = FAST_SEEDS if fast else SEEDS
     found = pendulums("pendulum_fast" if fast else "pendulum", seeds, paper=not fast)
     if fast:
         return [
             *found,
-            Wanted("hover", "hover", "hover_fast", METHOD, seeds),
-            Wanted("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 1_200_000}, seeds),
+            RunSpec("hover", "hover", "hover_fast", METHOD, seeds),
+            RunSpec("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 1_200_000}, seeds),
         ]
     return [
         *found,
-        Wanted("hover", "hover", "hover", METHOD | {"num_timesteps": 1_500_000, "num_evals": 25}, seeds),
-        Wanted("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 2_400_000, "num_evals": 20}, seeds),
-        Wanted("hover-flight", "hover", "hover", METHOD | {"num_timesteps": 4_500_000}),
-        Wanted("circle-flight", "circle", "circle", METHOD | {"num_timesteps": 4_500_000}),
+        RunSpec("hover", "hover", "hover", METHOD | {"num_timesteps": 1_500_000, "num_evals": 25}, seeds),
+        RunSpec("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 2_400_000, "num_evals": 20}, seeds),
+        RunSpec("hover-flight", "hover", "hover", METHOD | {"num_timesteps": 4_500_000}),
+        RunSpec("circle-flight", "circle", "circle", METHOD | {"num_timesteps": 4_500_000}),
     ]
 
 
-def pendulums(preset: str, seeds: int, *, paper: bool) -> list[Wanted]:
+def pendulums(preset: str, seeds: int, *, paper: bool) -> list[RunSpec]:
     """Both methods at two rates around the recipe's own; with `paper` at the paper's two rates too, held constant."""
     recipe = {name: load_preset(preset)[name] for name in ("learning_rate", "learning_rate_end")}
     rates = {"high": recipe, "low": {name: float(f"{value / RATIO:.6g}") for name, value in recipe.items()}}
@@ -83,7 +85,7 @@ def pendulums(preset: str, seeds: int, *, paper: bool) -> list[Wanted]:
         rates |= {f"paper-{name}": rate for name, rate in constant.items()}
     methods = {"": {}, "-ppo": PPO}
     return [
-        Wanted(f"pendulum-{rate}{method}", "pendulum", preset, flags | more, seeds)
+        RunSpec(f"pendulum-{rate}{method}", "pendulum", preset, flags | more, seeds)
         for rate, flags in rates.items()
         for method, more in methods.items()
     ]
@@ -92,22 +94,22 @@ def pendulums(preset: str, seeds: int, *, paper: bool) -> list[Wanted]:
 # Whether a run is there
 
 
-def current(folder: Path, run: RunConfig) -> bool:
+def is_current(folder: Path, run: RunConfig) -> bool:
     """Whether this very run is there, finished, made by the code and with the versions that are here now."""
-    return (folder / "summary.json").exists() and same(folder, run)
+    return (folder / "summary.json").exists() and is_same(folder, run)
 
 
-def same(folder: Path, run: RunConfig) -> bool:
+def is_same(folder: Path, run: RunConfig) -> bool:
     """Whether `folder` holds this very run, finished or not. On which devices and at which commit is no matter."""
     try:
         stored = json.loads((folder / "config.json").read_text())
         code = (folder / CODE).read_text()
     except (OSError, ValueError):
         return False
-    return isinstance(stored, dict) and decisive(stored) == decisive(run.model_dump(mode="json")) and code == sha256()
+    return isinstance(stored, dict) and deciding(stored) == deciding(run.model_dump(mode="json")) and code == sha256()
 
 
-def decisive(config: dict[str, Any]) -> dict[str, Any]:
+def deciding(config: dict[str, Any]) -> dict[str, Any]:
     """What of a config.json decides a run's numbers."""
     versions = {name: version for name, version in config.get("versions", {}).items() if name not in ("commit", "qrl")}
     return {name: config.get(name) for name in ("task", "learner", "seed", "seeds")} | {"versions": versions}
@@ -153,28 +155,28 @@ def _imports(path: Path) -> list[str]:
 # How a run is made
 
 
-def make(one: Wanted, folder: Path) -> float:
+def train(one: RunSpec, folder: Path, env: dict[str, str] | None = None) -> float:
     """Make the run as a user would, in a process of its own; an unfinished one of the same is gone on with.
 
     Returns its seconds; raises Failed. What else the folder held is removed.
     """
     words = [*one.words, "--out", str(folder)]
-    if same(folder, one.config()):
+    if is_same(folder, one.config()):
         words.append("--resume")
     else:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         (folder / CODE).write_text(sha256())
     begun = time.perf_counter()
-    qrl(words)
+    qrl(words, env)
     return time.perf_counter() - begun
 
 
-def qrl(words: list[str]) -> None:
-    """The command line in a process of its own; Failed if it fails."""
+def qrl(words: list[str], env: dict[str, str] | None = None) -> None:
+    """The command line in a process of its own, with `env` added to its environment; Failed if it fails."""
     command = [sys.executable, "-m", "qrl", *words]
     # In a session of its own, so that Ctrl-C reaches it once: through us.
-    with subprocess.Popen(command, env=environment(), start_new_session=True) as process:
+    with subprocess.Popen(command, env=environment() | (env or {}), start_new_session=True) as process:
         try:
             code = process.wait()
         except BaseException:

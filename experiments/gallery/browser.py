@@ -9,19 +9,19 @@ from selenium.webdriver.chrome.service import Service
 
 WIDTH, HEIGHT = 1280, 800
 PROGRAMS = ("chromium", "chromedriver")  # Debian: chromium, chromium-driver
-PATIENCE_SECONDS = 240  # the machine may be busy, and draws by its processor
+PATIENCE_SECONDS = 240  # software rendering on a machine that may be busy
 
 NEXT_FRAME = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 
 
 def missing() -> list[str]:
-    """What of PROGRAMS is not here."""
+    """The programs that are not installed."""
     return [name for name in PROGRAMS if not shutil.which(name)]
 
 
 @contextmanager
 def chromium(logs: Mapping[str, str]) -> Iterator[webdriver.Chrome]:
-    """Of WIDTH × HEIGHT, without a GPU and without a network; `logs`: which it keeps, and at which level."""
+    """A driver of WIDTH × HEIGHT pixels without GPU and network; `logs` maps each log kept to its level."""
     options = webdriver.ChromeOptions()
     options.binary_location = shutil.which("chromium") or ""
     for flag in ("headless=new", "no-sandbox", "use-angle=swiftshader", "enable-unsafe-swiftshader"):
@@ -47,13 +47,13 @@ def size(driver: webdriver.Chrome, width: int, height: int) -> None:
 
 
 def drawn(driver: webdriver.Chrome, address: str) -> str | None:
-    """Load the viewer's page and wait until its first start is drawn; what went wrong there, or None."""
+    """Load the viewer's page and wait until its first start is drawn; returns the error or None."""
     driver.get(address)
     return wait_for(driver, "qrlView.ready")
 
 
 def wait_for(driver: webdriver.Chrome, promise: str) -> str | None:
-    """Until a promise of the page is kept; why not, or None."""
+    """Wait for a promise of the page; returns the error or None."""
     return driver.execute_async_script(
         f"const done = arguments[0]; (async () => {promise})().then(() => done(null), error => done(String(error)))"
     )

@@ -1,11 +1,12 @@
-"""The gallery's page as Markdown: what the runs found, and the pictures that there are."""
+"""The gallery's page as Markdown: results of the runs, and the pictures that exist."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.figures.captions import Caption
-from experiments.figures.runs import Wanted
+from experiments.figures.runs import RunSpec
+from experiments.output import table
 
 SHIPPED = ("pendulum", "hover", "circle")
 ERRORS = "Errors over time: median and 5 to 95 % of 1,000 starts, beside the medians of the others."
@@ -35,11 +36,11 @@ VIEWED = "circle"
 NAMED = 5  # failures by their index
 
 
-class Flies(NamedTuple):
+class PresetResult(NamedTuple):
     """A shipped preset's run, PPO's beside it, and what `qrl evaluate` found."""
 
-    ours: Wanted
-    ppo: Wanted
+    ours: RunSpec
+    ppo: RunSpec
     folder: Path
     found: dict[str, Any]  # evaluation.json
 
@@ -48,46 +49,48 @@ class Flies(NamedTuple):
         return self.ours.task
 
 
-class Made(NamedTuple):
-    """How the gallery came to be."""
+class Provenance(NamedTuple):
+    """How the gallery was made."""
 
     command: str
     versions: dict[str, str]
-    there: set[str]  # files in gallery/
+    pictures: set[str]  # files in gallery/
 
 
-def page(made: Made, captions: dict[str, Caption], flies: list[Flies], sections: Sequence[str]) -> str:
-    """The gallery; `sections`: pages that other commands left, "" where they did not."""
+def page(
+    provenance: Provenance, captions: dict[str, Caption], results: list[PresetResult], sections: Sequence[str]
+) -> str:
+    """The gallery; `sections`: pages of other commands, "" where missing."""
+    claims = [[f"[{one.title}](#{name})", one.claim, f"**{one.verdict}**"] for name, one in captions.items()]
+    versions = ", ".join(f"{name} {version}" for name, version in provenance.versions.items())
     lines = [
         "# Gallery",
         "",
-        f"Made by `{made.command}` with {', '.join(f'{name} {version}' for name, version in made.versions.items())}.",
+        f"Made by `{provenance.command}` with {versions}.",
         "",
         "## What the paper claims, and what was found",
         "",
-        "| figure | the paper's claim | here |",
-        "|---|---|---|",
-        *(f"| [{told.title}](#{name}) | {told.claim} | **{told.verdict}** |" for name, told in captions.items()),
+        table(["figure", "the paper's claim", "here"], claims),
         "",
         "The figures' policies learn by the paper's method alone, without the analytic gradient that ends the shipped"
-        " presets; but trajectories are turned by the tasks' symmetries, which the paper does not do.",
+        " presets; but trajectories are augmented by the tasks' symmetries, which the paper does not do.",
         "",
     ]
-    for name, told in captions.items():
-        lines += [f'<a id="{name}"></a>', "", f"### {told.title}", "", f"![{told.title}](gallery/{name}.png)", ""]
-        lines += [told.shows, "", *told.found, "", f"**{told.verdict.capitalize()}.** {told.rule}"]
-        lines += [f"([How it was made.](gallery/{name}.md))", ""]
+    for name, caption in captions.items():
+        lines += [f'<a id="{name}"></a>', "", f"### {caption.title}", "", f"![{caption.title}](gallery/{name}.png)", ""]
+        lines += [caption.shows, "", *caption.found, "", f"**{caption.verdict.capitalize()}.** {caption.rule}"]
+        lines += [f"([How it was provenance.](gallery/{name}.md))", ""]
     lines += ["## The policies that the presets train", ""]
-    for one in flies:
-        lines += policy(one, made.there)
+    for one in results:
+        lines += policy(one, provenance.pictures)
     for text in filter(None, sections):
-        lines += [demoted(text), ""]
-    if "bench.png" in made.there:
+        lines += [nest_headings(text), ""]
+    if "bench.png" in provenance.pictures:
         lines += ["![Ratios of the bench](gallery/bench.png)", ""]
     return "\n".join(lines)
 
 
-def policy(one: Flies, there: set[str]) -> list[str]:
+def policy(one: PresetResult, there: set[str]) -> list[str]:
     """A task's policy: its numbers beside others', off nominal, its failures, and its pictures."""
     found = one.found
     (ppo,) = found["beside"].values()
@@ -96,10 +99,11 @@ def policy(one: Flies, there: set[str]) -> list[str]:
     lines = [f"### {one.task.capitalize()}", "", LEARNT[one.task]]
     lines += [f"`qrl {' '.join(one.ours.words)}`, {found['env_steps']:,} steps; PPO: `qrl {' '.join(one.ppo.words)}`,"]
     lines += [f"{ppo['env_steps']:,} steps. {found['starts']:,} fresh starts, deterministic policies.", ""]
-    lines += ["| | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
-    for key, (heading, factor, form) in rows.items():
-        cells = [cell(key, pilot.get(key), factor, form) for pilot in columns.values()]
-        lines.append(f"| {heading} | " + " | ".join(cells) + " |")
+    cells = [
+        [heading, *(cell(key, column.get(key), factor, form) for column in columns.values())]
+        for key, (heading, factor, form) in rows.items()
+    ]
+    lines.append(table(["", *columns], cells))
     if off := found.get("off_nominal"):
         shares = ", ".join(f"{name} {100 * result['success']:.1f} %" for name, result in off.items())
         lines += ["", f"Success of the policy off nominal (`--off-nominal`): {shares}."]
@@ -121,12 +125,12 @@ def failures(found: dict[str, Any]) -> str:
 
 
 def cell(key: str, value: float | None, factor: float, form: str) -> str:
-    """evaluation.json has null for what is infinite or no number."""
+    """null in evaluation.json: infinite or not measured."""
     if value is None:
         return "never" if key.startswith("settle") else "–"
     return f"{factor * value:{form}}"
 
 
-def demoted(text: str) -> str:
-    """A page as a section of another."""
+def nest_headings(text: str) -> str:
+    """Lower each heading by one level."""
     return "\n".join(f"#{line}" if line.startswith("#") else line for line in text.rstrip().splitlines())

@@ -6,7 +6,6 @@ Ends at the steps or the hours, whichever comes first, and leaves soak.csv (a ro
 beside the run folder; exit code 1 if a promise is broken.
 """
 
-import argparse
 import json
 import os
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from experiments.arguments import Parser
 from qrl import request, tasks
 from qrl.runs import files, record
 from qrl.training import devices, driver, loop
@@ -27,7 +27,7 @@ RETURN_LOSS = 0.05  # of the best return so far
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = Parser("soak", __doc__)
     parser.add_argument("--steps", type=float, default=2e8)
     parser.add_argument("--hours", type=float, default=1.0)
     parser.add_argument("--out", type=Path, default=Path("experiments/out/soak"))

@@ -1,7 +1,7 @@
 """The paper's theory (Sec. 3) on random tabular MDPs, where every quantity is exact in float64.
 
-The oracle is NumPy (`tabular_mdp.py`, and the formulas below, from the paper); where a claim concerns the objective,
-the objective is qrl's own.
+The oracle is NumPy (`tabular_mdp.py`, written from the paper); the objective is qrl's own. The mathematics behind it:
+docs/theory.md.
 """
 
 from collections.abc import Callable, Iterator
@@ -61,33 +61,6 @@ def dominates(mdp: MDP, pi: Array, mu: Array, form: Form, whose: Whose) -> Array
     advantage = tabular_mdp.advantage(mdp, mu if whose == "mu" else pi)
     left_side = dominance(jnp.log(pi), jnp.log(mu), jnp.asarray(advantage), form)
     return (np.asarray(left_side) >= 0).all((-1, -2))
-
-
-# Sec. 2.1 and 3.2: the return of one policy in terms of another
-
-
-def test_eta_is_the_discounted_sum_of_expected_rewards(rng: np.random.Generator) -> None:
-    """equ:etaDefinition, summed forward in time; guards the oracle itself."""
-    mdp, _, pi = trio(rng, batch=20)
-    occupied, total = mdp.start, np.zeros(20)
-    for t in range(800):
-        total += mdp.gamma**t * weighted(occupied, pi * mdp.reward)
-        occupied = np.einsum("bs,bsa,bsat->bt", occupied, pi, mdp.transition)
-    np.testing.assert_allclose(tabular_mdp.eta(mdp, pi), total, rtol=1e-11, atol=1e-11)
-
-
-def test_gain_is_a_mu_of_pi_minus_mu_weighted_by_rho_pi(rng: np.random.Generator) -> None:
-    """Sec. 3.2, the equation above equ:newEtaDifference."""
-    mdp, mu, pi = trio(rng)
-    formula = weighted(tabular_mdp.visitation(mdp, pi), (pi - mu) * tabular_mdp.advantage(mdp, mu))
-    np.testing.assert_allclose(formula, gain(mdp, pi, mu), rtol=1e-10, atol=1e-11)
-
-
-def test_gain_is_a_pi_of_pi_minus_mu_weighted_by_rho_mu(rng: np.random.Generator) -> None:
-    """Sec. 3.2, equ:newEtaDifference."""
-    mdp, mu, pi = trio(rng)
-    formula = weighted(tabular_mdp.visitation(mdp, mu), (pi - mu) * tabular_mdp.advantage(mdp, pi))
-    np.testing.assert_allclose(formula, gain(mdp, pi, mu), rtol=1e-10, atol=1e-11)
 
 
 # Sec. 3.2: the four dominating inequalities
@@ -196,39 +169,6 @@ def closed_form_delta(mdp: MDP, mu: Array) -> Array:
     return slope * mu / beta
 
 
-def test_closed_form_delta_is_the_constrained_optimum(rng: np.random.Generator) -> None:
-    """equ:deltaClosedForm solves the optimality conditions of the quadratic subject to sum_a delta = 0."""
-    mdp, mu, _ = trio(rng)
-    slope, beta = trust_region(mdp, mu)
-    system = np.zeros((300, 5, 5, 5))  # unknowns at each state: delta of four actions, then the multiplier
-    system[..., :4, :4] = (beta / mu)[..., None] * np.eye(4)
-    system[..., 4, :4] = system[..., :4, 4] = 1.0
-    solution = np.linalg.solve(system, np.concatenate([slope, np.zeros((300, 5, 1))], -1)[..., None])[..., 0]
-    np.testing.assert_allclose(closed_form_delta(mdp, mu), solution[..., :4], rtol=1e-9, atol=1e-14)
-    assert (np.abs(solution[..., 4]) < 1e-10).all(), "the constraint is not active"
-
-
-def test_any_other_delta_lowers_the_quadratic(rng: np.random.Generator) -> None:
-    """Sec. 3.1: equ:deltaClosedForm is the global maximum of rho^mu A^mu delta − beta delta²/(2 mu)."""
-    mdp, mu, _ = trio(rng)
-    slope, beta = trust_region(mdp, mu)
-
-    def quadratic(delta: Array) -> Array:
-        return (slope * delta - beta * delta**2 / (2 * mu)).sum((-1, -2))
-
-    delta = closed_form_delta(mdp, mu)
-    for size in (1e-3, 1e-2, 0.1, 1.0, 10.0):
-        nudge = size * np.abs(delta).max((-1, -2), keepdims=True) * rng.normal(size=delta.shape)
-        assert (quadratic(delta + nudge) < quadratic(delta)).all()
-
-
-def test_closed_form_delta_sums_to_zero(rng: np.random.Generator) -> None:
-    """Sec. 3.1: sum_a delta = 0 holds of itself, since sum_a mu A^mu = 0."""
-    mdp, mu, _ = trio(rng)
-    delta = closed_form_delta(mdp, mu)
-    assert (np.abs(delta.sum(-1)) < 1e-12 * np.abs(delta).sum(-1)).all()
-
-
 @each_form
 def test_closed_form_delta_dominates_and_improves(rng: np.random.Generator, form: Form) -> None:
     """Sec. 3.1 and 3.2: mu + delta is a policy where gamma ≥ 1/5, satisfies conditions 1 and 2, and beats mu."""
@@ -254,23 +194,6 @@ def test_one_transition_moves_its_action_by_the_sign_of_a(
     assert (np.sign(delta) == np.sign(advantage)).all()
 
 
-def test_kl_expansion_has_a_third_order_remainder(rng: np.random.Generator) -> None:
-    """Sec. 3.1: D_KL(mu || mu + delta) = sum_a delta²/(2 mu) − sum_a delta³/(3 mu²) + O(delta⁴)."""
-    mu = rng.dirichlet(np.full(4, 3.0), size=100)
-    delta = 0.3 * mu * rng.uniform(-1, 1, size=mu.shape)
-    delta -= mu * delta.sum(-1, keepdims=True)
-
-    def remainder(t: float) -> Array:
-        divergence = -(mu * np.log1p(t * delta / mu)).sum(-1)
-        return divergence - ((t * delta) ** 2 / (2 * mu)).sum(-1)
-
-    cubic = -(delta**3 / (3 * mu**2)).sum(-1)
-    scale = (np.abs(delta) ** 3 / mu**2).sum(-1)
-    for t in (0.1, 0.03, 0.01):
-        assert (np.abs(remainder(t) / t**3 - cubic) < t * scale).all()
-    assert np.abs(cubic / scale).max() > 0.1, "the third-order term itself is there"
-
-
 # The end of Sec. 3.2: the on/off-policy policy gradient
 
 
@@ -280,37 +203,9 @@ def slopes(function: Callable[[Array], Array], logits: Array, step: float = 1e-5
     return np.stack([(function(logits + nudge) - function(logits - nudge)) / (2 * step) for nudge in nudges], -1)
 
 
-def gradient_terms(mdp: MDP, logits: Array, mu: Array) -> tuple[Array, Array]:
-    """The two sums of the last equation of Sec. 3.2, each [batch, S·A]; Q^pi and pi are differentiated numerically."""
-    pi, rho = tabular_mdp.softmax(logits), tabular_mdp.visitation(mdp, mu)
-    pi_slope = slopes(tabular_mdp.softmax, logits)
-    q_slope = slopes(lambda x: tabular_mdp.q_value(mdp, tabular_mdp.softmax(x)), logits)
-    first = np.einsum("bs,bsak,bsa->bk", rho, pi_slope, tabular_mdp.q_value(mdp, pi))
-    return first, np.einsum("bs,bsa,bsak->bk", rho, pi - mu, q_slope)
-
-
 def eta_slope(mdp: MDP, logits: Array) -> Array:
     """The derivative of eta(pi) by central differences [batch, S·A]."""
     return slopes(lambda x: tabular_mdp.eta(mdp, tabular_mdp.softmax(x)), logits)
-
-
-def test_two_term_gradient_is_the_derivative_of_eta(rng: np.random.Generator) -> None:
-    """Sec. 3.2, the last equation, for any fixed mu."""
-    mdp, mu, pi = trio(rng, batch=50)
-    first, second = gradient_terms(mdp, np.log(pi), mu)
-    np.testing.assert_allclose(first + second, eta_slope(mdp, np.log(pi)), atol=1e-7)
-    assert np.abs(second).max() > 0.1, "Degris et al.'s first term alone is an approximation"
-
-
-def test_two_term_gradient_at_mu_is_the_policy_gradient_theorem(rng: np.random.Generator) -> None:
-    """Sec. 3.2, the last equation with mu = pi, is policyGradientTheoremForA of Sec. 2.2."""
-    mdp, mu, _ = trio(rng, batch=50)
-    first, second = gradient_terms(mdp, np.log(mu), mu)
-    rho, advantage = tabular_mdp.visitation(mdp, mu), tabular_mdp.advantage(mdp, mu)
-    theorem = np.einsum("bs,bsak,bsa->bk", rho, slopes(tabular_mdp.softmax, np.log(mu)), advantage)
-    np.testing.assert_allclose(second, 0.0, atol=1e-9)
-    np.testing.assert_allclose(first, theorem, atol=1e-7)
-    np.testing.assert_allclose(theorem, eta_slope(mdp, np.log(mu)), atol=1e-7)
 
 
 @each_margin

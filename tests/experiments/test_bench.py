@@ -29,7 +29,7 @@ def run(contestant: str, seed: int, *lines: dict, group: str = "pendulum", outco
         "group": group,
         "seed": seed,
         "outcome": outcome,
-        "said": "",
+        "error": "",
         "lines": list(lines),
     }
 
@@ -197,14 +197,16 @@ def test_a_command_tells_the_worst_of_its_checkpoints() -> None:
     checkpoints = [{"rms_position_m": 0.001}, {"rms_position_m": 0.004}, {"rms_position_m": 0.002}]
     nominal = {"success": 1.0, "rms_position_m": 0.001, "return_min": 3.0}
     off = {"latency": {"success": 0.99}, "noise": {"success": 0.98}}
-    assert qrl_command.told({**nominal, "checkpoints": checkpoints, "off_nominal": off}) == {
+    assert qrl_command.summary({**nominal, "checkpoints": checkpoints, "off_nominal": off}) == {
         "success": 1.0,
         "rms_position_m": 0.001,
         "worst_of_3_rms_position_m": 0.004,
         "off_nominal_success_latency": 0.99,
         "off_nominal_success_noise": 0.98,
     }
-    assert qrl_command.told({**nominal, "checkpoints": [{"rms_position_m": None}]})["worst_of_1_rms_position_m"] is None
+    assert (
+        qrl_command.summary({**nominal, "checkpoints": [{"rms_position_m": None}]})["worst_of_1_rms_position_m"] is None
+    )
 
 
 def test_a_peer_that_never_solves_gets_a_bound_in_the_picture() -> None:
@@ -236,37 +238,37 @@ def test_an_environment_is_reused_until_its_pins_change(tmp_path: Path) -> None:
 
 
 def test_a_run_leaves_its_lines_and_ends_on_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bench, "PEERS", tmp_path)
+    monkeypatch.setattr(bench, "BASELINES", tmp_path)
     monkeypatch.setattr(bench, "GRACE_SECONDS", 0.0)
     (tmp_path / "peer.py").write_text("import time\nprint('BENCH {\"steps\": 1}', flush=True)\ntime.sleep(60)\n")
     (tmp_path / "broken.py").write_text("print('BENCH {\"steps\": 2}')\nraise ValueError('a reason')\n")
-    found = bench.fly(Contestant("peer", "pendulum", "peer.py"), Path(sys.executable), 3, 2.0, tmp_path)
+    found = bench.run_contestant(Contestant("peer", "pendulum", "peer.py"), Path(sys.executable), 3, 2.0, tmp_path)
     assert (found["outcome"], found["lines"], found["seed"]) == ("out of time", [{"steps": 1}], 3)
-    found = bench.fly(Contestant("broken", "pendulum", "broken.py"), Path(sys.executable), 0, 60.0, tmp_path)
+    found = bench.run_contestant(Contestant("broken", "pendulum", "broken.py"), Path(sys.executable), 0, 60.0, tmp_path)
     assert (found["outcome"], found["lines"]) == ("exit code 1", [{"steps": 2}])
-    assert found["said"] == "ValueError: a reason"
+    assert found["error"] == "ValueError: a reason"
 
 
 def test_a_run_is_made_once(tmp_path: Path) -> None:
     """And again if it failed, was asked for otherwise, or elsewhere."""
     peer, path = Contestant("qrl", "pendulum", "qrl_train.py", ("--steps", "1")), tmp_path / "run.json"
-    assert not bench.made(path, peer, 60.0)
-    here = bench.circumstances(peer)
+    assert not bench.is_current(path, peer, 60.0)
+    here = bench.run_fingerprint(peer)
     assert "commit" not in here
     asked = {"command": ["qrl_train.py", "--steps", "1"], "budget_seconds": 60.0}
-    kept = asked | {"circumstances": here, "outcome": "done"}
+    kept = asked | {"fingerprint": here, "outcome": "done"}
     path.write_text(json.dumps(kept))
-    assert bench.made(path, peer, 60.0)
-    assert not bench.made(path, peer, 90.0)
-    assert not bench.made(path, peer._replace(words=("--steps", "2")), 60.0)
-    assert not bench.made(path, peer._replace(devices=2), 60.0)
+    assert bench.is_current(path, peer, 60.0)
+    assert not bench.is_current(path, peer, 90.0)
+    assert not bench.is_current(path, peer._replace(words=("--steps", "2")), 60.0)
+    assert not bench.is_current(path, peer._replace(devices=2), 60.0)
     for other in ({"CPU": "abacus"}, {"jax": "0.1"}, {"requirements": "others"}, {"code": "other"}):
-        path.write_text(json.dumps(kept | {"circumstances": here | other}))
-        assert not bench.made(path, peer, 60.0)
+        path.write_text(json.dumps(kept | {"fingerprint": here | other}))
+        assert not bench.is_current(path, peer, 60.0)
     path.write_text(json.dumps(asked | {"outcome": "done"}))
-    assert not bench.made(path, peer, 60.0)
+    assert not bench.is_current(path, peer, 60.0)
     path.write_text(json.dumps(kept | {"outcome": "exit code 1"}))
-    assert not bench.made(path, peer, 60.0)
+    assert not bench.is_current(path, peer, 60.0)
 
 
 @pytest.mark.parametrize(
@@ -291,7 +293,7 @@ def test_wrong_input_gets_one_line(words: list[str], says: str, capsys: pytest.C
 def test_every_contestant_is_there() -> None:
     assert len({(c.group, c.name) for c in CONTESTANTS}) == len(CONTESTANTS)
     for contestant in CONTESTANTS:
-        assert (bench.PEERS / contestant.script).is_file()
-        assert contestant.environment is None or (bench.PEERS / f"{contestant.environment}.txt").is_file()
+        assert (bench.BASELINES / contestant.script).is_file()
+        assert contestant.environment is None or (bench.BASELINES / f"{contestant.environment}.txt").is_file()
     named = [c.name for c in chosen(["pendulum/brax-ppo", "circle"])]
     assert named == ["Brax PPO", "qrl", "qrl without APG", "Brax PPO"]

@@ -19,10 +19,10 @@ from experiments.figures import flights as figure_flights
 from experiments.figures import make as figures
 from experiments.figures import plots as draw
 from experiments.figures import runs as figure_runs
-from experiments.figures.captions import CONFIRMED, EXCEEDED, NOT, Made
-from experiments.figures.flights import Flown
+from experiments.figures.captions import CONFIRMED, EXCEEDED, NOT, Provenance
+from experiments.figures.flights import PolicyFlights
 from experiments.figures.plots import Curves, Rate
-from experiments.figures.runs import CODE, Wanted
+from experiments.figures.runs import CODE, RunSpec
 from qrl.algorithm.learner import LearnerState
 from qrl.config import load_preset
 from qrl.evaluation.starts import evaluation_starts
@@ -34,10 +34,10 @@ from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs import task
 
-HOVER = Wanted("hover", "hover", "hover_fast", {"num_timesteps": 320_000}, 2)
+HOVER = RunSpec("hover", "hover", "hover_fast", {"num_timesteps": 320_000}, 2)
 
 
-def folder_of(path: Path, one: Wanted, *, finished: bool = True, **changes: Any) -> Path:
+def folder_of(path: Path, one: RunSpec, *, finished: bool = True, **changes: Any) -> Path:
     """A run's folder as `make` leaves it, but for its checkpoints; `changes` to its config.json."""
     path.mkdir(parents=True, exist_ok=True)
     files.write_json(path / "config.json", one.config().model_dump(mode="json") | changes)
@@ -47,7 +47,7 @@ def folder_of(path: Path, one: Wanted, *, finished: bool = True, **changes: Any)
     return path
 
 
-def with_metrics(path: Path, one: Wanted, returns: list[list[float]], success: list[list[float]]) -> Path:
+def with_metrics(path: Path, one: RunSpec, returns: list[list[float]], success: list[list[float]]) -> Path:
     """A finished run of which each seed reported `returns` and `success` [seeds][x], every 100 steps."""
     folder = folder_of(path, one)
     for seed, (r, s) in enumerate(zip(returns, success, strict=True)):
@@ -67,12 +67,12 @@ def curves(*returns: list[float], success: tuple[list[float], ...] = (), label: 
     return Curves(label, 100.0 * np.arange(1, values.shape[1] + 1), values, shares)
 
 
-def flown(name: str, observations: np.ndarray, succeed: list[bool]) -> Flown:
+def flown(name: str, observations: np.ndarray, succeed: list[bool]) -> PolicyFlights:
     n = len(succeed)
     sizes = {f"rms_{what}_m": np.arange(1, n + 1) / 1000.0 for what in ("position", "radius", "height")}
     settle_s = np.where(succeed, 1.25, np.inf)
     measures = sizes | {"success": np.array(succeed, float), "settle_s": settle_s}
-    return Flown(3, 1_234_000, task.load(name), observations, measures)
+    return PolicyFlights(3, 1_234_000, task.load(name), observations, measures)
 
 
 def circling(n: int, vx: float = 2.0, vy: float = 2.0) -> np.ndarray:
@@ -90,10 +90,10 @@ def circling(n: int, vx: float = 2.0, vy: float = 2.0) -> np.ndarray:
 def test_a_run_is_current_only_if_all_that_decides_it_is_the_same(tmp_path: Path) -> None:
     config = HOVER.config()
     stored = config.model_dump(mode="json")
-    assert figure_runs.current(folder_of(tmp_path / "same", HOVER), config)
-    assert not figure_runs.current(tmp_path / "none", config)
-    assert not figure_runs.current(folder_of(tmp_path / "unfinished", HOVER, finished=False), config)
-    assert figure_runs.same(tmp_path / "unfinished", config)
+    assert figure_runs.is_current(folder_of(tmp_path / "same", HOVER), config)
+    assert not figure_runs.is_current(tmp_path / "none", config)
+    assert not figure_runs.is_current(folder_of(tmp_path / "unfinished", HOVER, finished=False), config)
+    assert figure_runs.is_same(tmp_path / "unfinished", config)
     for i, change in enumerate(
         (
             {"learner": stored["learner"] | {"gamma": 0.5}},
@@ -103,9 +103,9 @@ def test_a_run_is_current_only_if_all_that_decides_it_is_the_same(tmp_path: Path
             {"versions": stored["versions"] | {"jax": "0.1"}},
         )
     ):
-        assert not figure_runs.current(folder_of(tmp_path / f"other {i}", HOVER, **change), config)
+        assert not figure_runs.is_current(folder_of(tmp_path / f"other {i}", HOVER, **change), config)
     elsewhere = {"devices": ["another"], "versions": stored["versions"] | {"commit": "another"}}
-    assert figure_runs.current(folder_of(tmp_path / "elsewhere", HOVER, **elsewhere), config)
+    assert figure_runs.is_current(folder_of(tmp_path / "elsewhere", HOVER, **elsewhere), config)
 
 
 def test_a_run_of_other_code_or_a_damaged_one_is_not_current(tmp_path: Path) -> None:
@@ -115,7 +115,7 @@ def test_a_run_of_other_code_or_a_damaged_one_is_not_current(tmp_path: Path) -> 
     (folder_of(tmp_path / "odd", HOVER) / "config.json").write_text("[]")
     (folder_of(tmp_path / "codeless", HOVER) / CODE).unlink()
     for name in ("code", "damaged", "odd", "codeless"):
-        assert not figure_runs.current(tmp_path / name, config)
+        assert not figure_runs.is_current(tmp_path / name, config)
 
 
 def test_the_code_of_a_run_is_what_decides_its_numbers() -> None:
@@ -134,12 +134,12 @@ def test_an_unfinished_run_goes_on_and_a_stale_one_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     called: list[list[str]] = []
-    monkeypatch.setattr(figure_runs, "qrl", lambda words, **_: called.append(words))
+    monkeypatch.setattr(figure_runs, "qrl", lambda words, *_: called.append(words))
     unfinished = folder_of(tmp_path / "unfinished", HOVER, finished=False)
     stale = folder_of(tmp_path / "stale", HOVER, seeds=3)
     for folder in (unfinished, stale, tmp_path / "new"):
         (folder.mkdir() if not folder.exists() else (folder / "kept").touch())
-        figure_runs.make(HOVER, folder)
+        figure_runs.train(HOVER, folder)
         assert (folder / CODE).read_text() == figure_runs.sha256()
     words = ["train", "hover", "--seeds", "2", "--preset", "hover_fast", "--num-timesteps", "320000", "--out"]
     assert called == [
@@ -154,11 +154,11 @@ def test_an_unfinished_run_goes_on_and_a_stale_one_is_made_again(
 
 def test_a_current_run_is_not_made_again_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
-    monkeypatch.setattr(figure_runs, "qrl", lambda words, **_: called.append(words))
+    monkeypatch.setattr(figure_runs, "qrl", lambda words, *_: called.append(words))
     folder = folder_of(tmp_path / "run", HOVER)
-    figures.obtain(HOVER, folder, fresh=False)
+    figures.ensure_run(HOVER, folder, fresh=False)
     assert called == []
-    figures.obtain(HOVER, folder, fresh=True)
+    figures.ensure_run(HOVER, folder, fresh=True)
     assert len(called) == 1
     assert "--resume" not in called[0]
 
@@ -176,7 +176,7 @@ def test_a_run_that_fails_gets_one_line(
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_every_figure_has_its_runs(fast: bool) -> None:
-    plan = figure_runs.wanted(fast=fast)
+    plan = figure_runs.plan(fast=fast)
     assert len({one.name for one in plan}) == len(plan)
     for name in figures.FIGURES:
         for one in figures.needed(name, plan):
@@ -189,7 +189,7 @@ def test_every_figure_has_its_runs(fast: bool) -> None:
 
 def test_the_pendulums_rates() -> None:
     """The paper's own, and two in their ratio; PPO at each."""
-    plan = {one.name: one for one in figure_runs.wanted(fast=False)}
+    plan = {one.name: one for one in figure_runs.plan(fast=False)}
     rates = {name: one.flags["learning_rate"] for name, one in plan.items() if one.task == "pendulum"}
     assert (rates["pendulum-paper-high"], rates["pendulum-paper-low"]) == (1e-4, 0.5e-5)
     assert rates["pendulum-high"] / rates["pendulum-low"] == pytest.approx(20.0)
@@ -296,7 +296,7 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
         yield make_trainer(env, config.learner).init(seeds(0, 1), inputs).learner, 7
 
     monkeypatch.setattr(restore, "iter_learners", untrained)
-    trial, nominal = (figure_flights.flown(folder, trial=trial, starts=2) for trial in (True, False))
+    trial, nominal = (figure_flights.fly_policy(folder, trial=trial, starts=2) for trial in (True, False))
     for began in trial.observations[:, 0]:
         np.testing.assert_allclose(began[9:15], [-1.58, 0.99, 1.45, -2.39, 6.20, 0.77], rtol=1e-6)
     others = [*range(9), 15, 16, 17]
@@ -316,7 +316,7 @@ def test_a_caption_says_how_it_was_made_and_its_numbers_are_the_runs(tmp_path: P
         tmp_path / "hover", HOVER, [[10.0, 30.5, 150.0], [20.0, 40.5, 160.0]], [[0.0, 0.99, 1.0], [0.0, 0.5, 1.0]]
     )
     caption = captions.hover(figures.curves(figures.Source(HOVER, folder)))
-    page = captions.page(caption, Made("make figures FAST=1", "abc123", "; a note", [(HOVER, folder)]))
+    page = captions.page(caption, Provenance("make figures FAST=1", "abc123", "; a note", [(HOVER, folder)]))
     # By hand: quartiles of 150 and 160; 99 % first at the second report and at the third.
     assert "return 155.0 [152.5 … 157.5], success 100 [100 … 100] %" in page
     assert "2 of 2 seeds" in page
@@ -328,7 +328,7 @@ def test_a_caption_says_how_it_was_made_and_its_numbers_are_the_runs(tmp_path: P
         assert f"{name} {version}" in page
     devices = [f"TFRT_CPU_{i}" for i in range(2)]
     files.write_json(folder / "config.json", HOVER.config().model_dump(mode="json") | {"devices": devices})
-    page = captions.page(caption, Made("make figures", "abc123", "", [(HOVER, folder)]))
+    page = captions.page(caption, Provenance("make figures", "abc123", "", [(HOVER, folder)]))
     assert "`JAX_NUM_CPU_DEVICES=2 qrl train hover --seeds 2" in page
 
 
@@ -433,7 +433,7 @@ def test_both_grids_hold_the_rows_that_the_table_explains(name: str) -> None:
 
 def test_a_stale_sweep_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     called: list[list[str]] = []
-    monkeypatch.setattr(figure_runs, "qrl", lambda words, **_: called.append(words))
+    monkeypatch.setattr(figure_runs, "qrl", lambda words, *_: called.append(words))
     grid, out = tmp_path / "grid.json", tmp_path / "out"
     grid.write_text("{}")
     for text, kept in (("{}", False), ("{}", True), ('{"seeds": 2}', False)):

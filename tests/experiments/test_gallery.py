@@ -14,7 +14,7 @@ from cross_targets import need
 from experiments.figures import make as figures
 from experiments.figures import runs as figure_runs
 from experiments.figures.captions import CONFIRMED, NOT, Caption
-from experiments.figures.runs import Wanted
+from experiments.figures.runs import RunSpec
 from experiments.gallery import browser
 from experiments.gallery import make as gallery
 from qrl.runs import files
@@ -48,7 +48,7 @@ class Stubs:
         self.folder, self.asked = folder, list[list[str]]()
         monkeypatch.setattr(figures, "figures", self.figures)
         monkeypatch.setattr(figure_runs, "qrl", self.qrl)
-        monkeypatch.setattr(gallery, "photograph", lambda _, __, target: target.write_text("view"))
+        monkeypatch.setattr(gallery, "screenshot", lambda _, __, target: target.write_text("view"))
 
     def figures(self, names: list[str], out: Path, *_: Any, **__: Any) -> dict[str, Caption]:
         out.mkdir(parents=True, exist_ok=True)
@@ -57,10 +57,10 @@ class Stubs:
                 (out / f"{name}.{form}").write_text(f"{out.name} {name}")
         return CAPTIONS
 
-    def qrl(self, words: list[str], **_: Any) -> None:
+    def qrl(self, words: list[str], *_: Any) -> None:
         self.asked.append(words)
         if words[0] == "train":
-            one = Wanted("", words[1], words[words.index("--preset") + 1] if "--preset" in words else words[1], {})
+            one = RunSpec("", words[1], words[words.index("--preset") + 1] if "--preset" in words else words[1], {})
             folder = Path(words[words.index("--out") + 1])
             files.write_json(folder / "config.json", one.config().model_dump(mode="json"))
             files.write_json(folder / "summary.json", {})
@@ -71,7 +71,7 @@ class Stubs:
 
     def bench(self) -> None:
         (self.folder / "runs" / "bench").mkdir(parents=True)
-        (self.folder / "runs" / "bench" / "bench.md").write_text("# qrl beside its peers\n\nfast\n")
+        (self.folder / "runs" / "bench" / "bench.md").write_text("# qrl beside other trainers and simulators\n\nfast\n")
         (self.folder / "runs" / "bench" / "bench.png").write_text("bench")
 
     def make(self, *words: str) -> Path:
@@ -106,7 +106,7 @@ def test_each_claim_has_its_verdict(made: Path) -> None:
 
 def test_numbers_are_those_of_the_evaluation(made: Path) -> None:
     page = made.read_text()
-    assert page.count("| | policy | PPO | lqr |") == 3
+    assert page.count("|  | policy | PPO | lqr |") == 3
     assert "| return | 165.7 | 157.2 | 120.6 |" in page
     assert "| success, % | 99.8 | 100.0 | 92.3 |" in page
     assert "| settle, p95, s | 0.91 | 2.00 | never |" in page
@@ -120,7 +120,7 @@ def test_numbers_are_those_of_the_evaluation(made: Path) -> None:
 
 
 def test_what_other_commands_left_is_a_section(made: Path) -> None:
-    assert "\n## qrl beside its peers\n\nfast\n" in made.read_text()
+    assert "\n## qrl beside other trainers and simulators\n\nfast\n" in made.read_text()
     assert "objectives" not in made.read_text()
 
 
@@ -148,7 +148,7 @@ def test_pictures_that_are_not_there_are_not_linked(stubs: Stubs, monkeypatch: p
     stubs.make()
     (stubs.folder / "runs" / "bench" / "bench.png").unlink()
     (stubs.folder / "docs" / "gallery" / "view.png").unlink()
-    monkeypatch.setattr(gallery, "photograph", lambda *_: None)
+    monkeypatch.setattr(gallery, "screenshot", lambda *_: None)
     page = stubs.make()
     assert not (page.parent / "gallery" / "bench.png").exists()
     assert "bench.png" not in page.read_text()
@@ -166,7 +166,7 @@ def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     )
 
 
-def test_the_viewer_is_photographed(tmp_path: Path) -> None:
+def test_the_viewer_is_screenshoted(tmp_path: Path) -> None:
     """Its scene, whole: the vehicle's and the tolerance's colours, down to where the scene ends."""
     need(browser.missing())
     t = np.arange(101) * 0.01
@@ -175,7 +175,7 @@ def test_the_viewer_is_photographed(tmp_path: Path) -> None:
     observations[..., 9] = np.cos(t)
     flown = viewer.Recording([0], observations, actions)
     (tmp_path / "view.html").write_text(viewer.page(task.load("hover"), "made up", flown))
-    gallery.photograph(tmp_path / "view.html", "#start=0&t=0.5", tmp_path / "view.png")
+    gallery.screenshot(tmp_path / "view.html", "#start=0&t=0.5", tmp_path / "view.png")
     pixels = (255 * image.imread(tmp_path / "view.png")[..., :3]).astype(int)
     assert pixels.shape == (browser.HEIGHT, browser.WIDTH, 3)
     scene = pixels[200:600, 200:600]
@@ -192,6 +192,6 @@ def test_a_picture_that_cannot_be_taken_stays(
     monkeypatch.setattr(browser, "drawn", lambda *_: "no scene")
     monkeypatch.setattr(browser, "wait_for", lambda *_: None)
     (tmp_path / "view.png").write_text("old")
-    gallery.photograph(tmp_path / "view.html", "", tmp_path / "view.png")
+    gallery.screenshot(tmp_path / "view.html", "", tmp_path / "view.png")
     assert (tmp_path / "view.png").read_text() == "old"
     assert ("missing here: chromium" if missing else "no scene") in capsys.readouterr().err

@@ -77,7 +77,7 @@ def versions() -> dict[str, str]:
 
 def commit() -> str:
     """The commit of this code, with a "+" if tracked files have changed since; "unknown" outside a checkout."""
-    root = Path(__file__).parents[2]
+    root = Path(__file__).parents[3]
     try:
         if not (root / ".git").exists():
             return "unknown"
