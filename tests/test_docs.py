@@ -30,7 +30,11 @@ def commands() -> list[str]:
     found = []
     for page in PAGES:
         for block in fenced(page, "sh"):
-            found += [line for line in block.splitlines() if re.match(r"make\b|.*\bqrl (train|evaluate|export|view|sweep)", line)]
+            found += [
+                line
+                for line in block.splitlines()
+                if re.match(r"make\b|.*\bqrl (train|evaluate|export|view|sweep)", line)
+            ]
     return sorted(set(found))
 
 
@@ -90,7 +94,7 @@ def test_readme_is_short() -> None:
 
 
 def test_results_are_of_the_presets_that_ship() -> None:
-    """docs/results.json has two rows for hover and circle, of as many steps as the presets make, and README shows them."""
+    """docs/results.json has two rows for hover and circle, of as many steps as their presets; README shows them."""
     from experiments import results
 
     found = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))

@@ -1,8 +1,10 @@
 """From a task's name or file to an environment that can be trained: where learner and worlds meet."""
 
 import contextlib
+import importlib
 import io
 import os
+import sys
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -33,13 +35,30 @@ def foreign_tasks() -> list[str]:
 
 
 def task_record(name: str) -> TaskRecord:
-    """The task of a shipped name, a `.json` path or one of Brax's names."""
+    """The task of a shipped name, a `.json` path, one of Brax's names, or "module:factory"."""
+    if ":" in name and not name.endswith(".json"):
+        _made_by_factory(name)
+        return TaskRecord(name=name, spec=None)
     if name not in task_spec.shipped() and not name.endswith(".json"):
         if name in foreign_tasks():
             return TaskRecord(name=name, spec=None)
         raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*task_spec.shipped(), *foreign_tasks()])}")
     spec = task_spec.load(name).model_dump(mode="json", exclude_none=True)
     return TaskRecord(name=_folder(Path(name).stem, name), spec=spec)
+
+
+def _made_by_factory(name: str) -> Env:
+    """The environment of "module:factory", a function of the user's without arguments; BadInput if there is none."""
+    module_name, _, factory_name = name.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        env = getattr(importlib.import_module(module_name), factory_name)()
+    except Exception as error:  # the user's code may raise anything
+        raise BadInput(f"task '{name}': cannot be made: {type(error).__name__}: {error}") from None
+    if missing := [a for a in ("reset", "step", "observation_size", "action_size") if not hasattr(env, a)]:
+        raise BadInput(f"task '{name}': expected an environment like Brax's, found one without {', '.join(missing)}")
+    return env
 
 
 def task_named(name: str, path: Path) -> TaskRecord:
@@ -59,6 +78,8 @@ def _folder(name: str, where: str) -> str:
 
 def environment(record: TaskRecord) -> Env:
     """The Brax environment of a recorded task."""
+    if ":" in record.name and record.spec is None:
+        return _made_by_factory(record.name)
     if record.spec is None:
         return _brax_envs().get_environment(record.name)
     return worlds.from_task(spec(record))
@@ -74,7 +95,9 @@ def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
     if record.spec is not None:
         spec = task_spec.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
         return TaskRecord(name=_folder(record.name, f"{where}: key 'task.name'"), spec=spec)
-    if record.name not in foreign_tasks():
+    if ":" in record.name:
+        _made_by_factory(record.name)
+    elif record.name not in foreign_tasks():
         raise BadInput(f"{where}: key 'task.name': unknown task '{record.name}'")
     return record
 

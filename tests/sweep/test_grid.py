@@ -90,9 +90,9 @@ def test_samples_are_uniform_and_repeatable(tmp_path: Path) -> None:
     for draws in (logs, gammas):  # Kolmogorov–Smirnov at 1 in 10,000
         assert np.max(np.abs(np.sort(draws) - np.arange(400) / 400)) < 2.2 / 20
     assert abs(np.corrcoef(logs, gammas)[0, 1]) < 0.2
-    assert [p.place for p in load(tmp_path, data).points] == [p.place for p in found.points]
+    assert [p.coordinates for p in load(tmp_path, data).points] == [p.coordinates for p in found.points]
     data["sample"] = {"count": 400, "seed": 8}
-    assert [p.place for p in load(tmp_path, data).points] != [p.place for p in found.points]
+    assert [p.coordinates for p in load(tmp_path, data).points] != [p.coordinates for p in found.points]
 
 
 def test_a_path_reaches_into_the_vehicle(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
     preset = load_preset("pendulum")
     ours = ("ours", preset["replay_unrolls"], preset["lam"])
     found = load(tmp_path, {"task": "pendulum", "axes": {"method": named, "gamma": [0.9, 0.99]}})
-    assert [(p.place["method"], p.learner.replay_unrolls, p.learner.lam) for p in found.points] == [
+    assert [(p.coordinates["method"], p.learner.replay_unrolls, p.learner.lam) for p in found.points] == [
         ours,
         ours,
         ("PPO", 1, 0.93),
@@ -149,7 +149,7 @@ def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -
     for axis, what in (("task.reward.w_torque_1_N2m2", "reward"), ("task.start.angle_rad", "start")):
         axes = {axis: [0.1, 0.2]}
         assert len(load(tmp_path, {"task": "pendulum", "axes": axes}).points) == 2
-        with pytest.raises(BadInput, match=f"judged alike, found another {what}"):
+        with pytest.raises(BadInput, match=f"evaluated alike, found another {what}"):
             load(tmp_path, {"task": str(task), "axes": axes})
     load(tmp_path, {"task": "pendulum", "axes": {"episode_length": [100, 200]}})
 
@@ -180,7 +180,7 @@ WRONG: dict[str, tuple[dict, str]] = {
     "not a number": ({"axes": {"sigma": [float("nan")]}}, r"key 'sigma': expected a finite number"),
     "a fraction of a count": ({"axes": {"num_envs": [8, 8.5]}}, r"at num_envs 8.5: key 'num_envs'"),
     "wrong sense in the task": ({"axes": {"task.rod.mass_kg": [-1.0]}}, r"key 'rod.mass_kg': expected greater than 0"),
-    "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"judged is the same for all points"),
+    "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"evaluation_key is the same for all points"),
     "duplicate values": ({"axes": {"gamma": [0.9, 0.9]}}, r"expected each point once, found gamma 0.9 and gamma 0.9"),
     "duplicate by another way": (
         {"axes": {"num_envs": [16, 16.0]}},
@@ -204,19 +204,19 @@ WRONG: dict[str, tuple[dict, str]] = {
     ),
     "another period": (
         {"axes": {"task.control_period_s": [0.05, 0.02]}},
-        r"judged alike, found another control period of its flights at task.control_period_s 0.05 and at",
+        r"evaluated alike, found another control period of its flights at task.control_period_s 0.05 and at",
     ),
     "returns of other lengths": (
         {"axes": {"task.episode_steps": [200, 100]}},
-        r"judged alike, found another number of steps of its return at task.episode_steps 200 and at",
+        r"evaluated alike, found another number of steps of its return at task.episode_steps 200 and at",
     ),
     "flights of other lengths": (
         {"task": "inverted_pendulum", "axes": {"episode_length": [200, 100]}},
-        r"judged alike, found another length of a flight \(episode_length\) at episode_length 200 and at",
+        r"evaluated alike, found another length of a flight \(episode_length\) at episode_length 200 and at",
     ),
     "other starts": (
         {"axes": {"num_eval_envs": [10, 20]}},
-        r"judged alike, found another number of flights",
+        r"evaluated alike, found another number of flights",
     ),
     "fixed and axis": ({"axes": GAMMA, "fixed": {"gamma": 0.9}}, r"'axes.gamma': 'gamma' is set in 'fixed' too"),
     "two axes": ({"axes": {**GAMMA, "m": {"a": {"gamma": 0.5}}}}, r"'gamma' is set in 'axes.gamma' too"),

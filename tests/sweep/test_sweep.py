@@ -238,7 +238,7 @@ def test_ctrl_c_ends_with_exit_code_1_and_keeps_its_chunks(tmp_path: Path) -> No
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (1, "")
-    assert "the same command goes on" in out
+    assert "rerun the same command to resume" in out
     assert 0 < len(runner.finished(tmp_path / "out" / "chunks")) < 400
     assert not (tmp_path / "out" / "summary.json").exists()
 
@@ -392,11 +392,13 @@ def three_points(tmp_path: Path) -> Any:
 
 def test_quartiles_are_numpys_and_divergence_counts_as_the_worst(three_points: Any) -> None:
     values = [[1.0, 2.0, 3.0, 10.0], [5.0, 6.0, 7.0, 8.0], [9.0, 9.0, 9.0, 9.0]]
-    sick = {(1, 2), (2, 0), (2, 1), (2, 2)}
+    diverged = {(1, 2), (2, 0), (2, 1), (2, 2)}
     found = {
-        4 * i + j: result(v, diverged="NaN" * ((i, j) in sick)) for i, vs in enumerate(values) for j, v in enumerate(vs)
+        4 * i + j: result(v, diverged="NaN" * ((i, j) in diverged))
+        for i, vs in enumerate(values)
+        for j, v in enumerate(vs)
     }
-    first, second, third = results.findings(three_points, found)
+    first, second, third = results.summaries(three_points, found)
     quartiles = dict(zip(("q1", "median", "q3"), np.quantile(values[0], [0.25, 0.5, 0.75]), strict=True))
     assert first["return_mean"] == quartiles
     assert second["return_mean"]["median"] == np.median([-np.inf, 5.0, 6.0, 8.0]) == 5.5
@@ -408,10 +410,10 @@ def test_quartiles_are_numpys_and_divergence_counts_as_the_worst(three_points: A
 def test_success_ranks_before_return_and_the_middle_seed_repeats(three_points: Any) -> None:
     values = [[(9.0, 0.5)] * 4, [(4.0, 1.0), (1.0, 1.0), (3.0, 1.0), (2.0, 1.0)], [(1.0, 1.0)] * 4]
     found = {4 * i + j: result(*v) for i, vs in enumerate(values) for j, v in enumerate(vs)}
-    findings = results.findings(three_points, found)
+    findings = results.summaries(three_points, found)
     assert results.best(findings, found, 4) == 1
     assert [f["point"] for f in results.ranked(findings)] == [1, 2, 0]
-    assert results.repeat(three_points, found, 1).seed == 3  # of returns 4, 1, 3, 2 the lower median, 2
+    assert results.best_run_config(three_points, found, 1).seed == 3  # of returns 4, 1, 3, 2 the lower median, 2
 
 
 @pytest.mark.parametrize(
@@ -433,18 +435,18 @@ def test_a_seed_that_diverged_never_settled(three_points: Any) -> None:
     found = {i: result(1.0, diverged="NaN" * (i < 5)) for i in range(12)}
     for kept in found.values():
         kept.rows[0]["settle_median_s"] = kept.rows[0]["rms_m"] = 2.0
-    findings = results.findings(three_points, found)
+    findings = results.summaries(three_points, found)
     for name in ("settle_median_s", "rms_m"):
         assert [(f[name]["median"], f[name]["q3"]) for f in findings] == [(np.inf, np.inf), (2.0, np.inf), (2.0, 2.0)]
     assert all(np.isnan(f["success"]["median"]) for f in findings)
     assert [f["point"] for f in results.ranked(findings)] == [1, 2, 0]
     found[11].rows[0]["success"] = 0.0
-    assert results.findings(three_points, found)[0]["success"]["median"] == 0.0
+    assert results.summaries(three_points, found)[0]["success"]["median"] == 0.0
 
 
 def test_where_all_diverge_there_is_no_best(three_points: Any) -> None:
     found = {i: result(1.0, diverged="NaN") for i in range(12)}
-    assert results.best(results.findings(three_points, found), found, 4) is None
+    assert results.best(results.summaries(three_points, found), found, 4) is None
 
 
 @pytest.mark.parametrize(

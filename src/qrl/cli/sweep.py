@@ -1,4 +1,4 @@
-"""The command `sweep`: a grid file to a folder of results; the same command goes on with an interrupted one."""
+"""`qrl sweep`: from a grid file to a folder of results; rerun to resume."""
 
 import argparse
 import json
@@ -9,10 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from rich.progress import BarColumn, Progress, TextColumn
 
 from qrl import tasks
-from qrl.cli.terminal import DONE, FAILED, clock, complain, console, stop_requested
+from qrl.cli.terminal import DONE, FAILED, clock, console, print_error, progress_bar, stop_requested
 from qrl.runs import files, record
 from qrl.sweep import grid as grids
 from qrl.sweep import plot, results
@@ -26,24 +25,24 @@ from qrl.training.trainer import make_trainer
 from qrl_envs.specfile import BadInput, read
 
 SHOWN = 20  # points in the table on the terminal
-POLL_SECONDS = 0.5  # between two looks at what the other processes have finished
+POLL_SECONDS = 0.5  # between two checks of the other processes' results
 
 
 def sweep(args: argparse.Namespace) -> int:
     began = time.perf_counter()
     process = multihost.this_process(args.process_id, args.processes, args.coordinator, os.environ)
     given = args.memory_gb * 1e9 if args.memory_gb is not None else None
-    grid = grids.load(args.grid, given or devices.host_bytes())  # before the others are waited for
+    grid = grids.load(args.grid, given or devices.host_bytes())  # before waiting for other processes
     multihost.join(process)
     budget = given or devices.memory_bytes()
     out: Path = args.out or Path("runs") / args.grid.stem
     held = _held(out, grid)
     if held and (out / "summary.json").exists() and (out / "sweep.png").exists():
-        console.print(f"{out}: finished already; nothing to do")
+        console.print(f"{out}: complete already; nothing to do")
         return _ending(out)
     groups = _groups(grid, process, budget, args.grid)
     out.mkdir(parents=True, exist_ok=True)
-    busy = f"{out}: another sweep is at work in it; wait for its end, or give another OUT"
+    busy = f"{out}: in use by another sweep; wait for its end, or give another OUT"
     with files.locked(out / f"process-{process.number}.lock", busy):
         return _work(args, began, process, budget, grid, groups, out)
 
@@ -57,7 +56,7 @@ def _work(
     groups: list[Group],
     out: Path,
 ) -> int:
-    """What is done while nobody else may: train what is left, and write what was found."""
+    """With the folder locked: train what is left, and write the results."""
     _prepare(out, grid, process, _held(out, grid))
     total = len(grid.points) * len(grid.seeds)
     console.print(
@@ -69,7 +68,7 @@ def _work(
         _follow(groups, out, budget, stopped)
         found = _all_results(out, total, process, stopped)
     if found is None:
-        console.print("stopped; the same command goes on")
+        console.print("stopped; rerun the same command to resume")
         return FAILED
     if process.number:
         return DONE  # process 0 writes the results
@@ -77,7 +76,7 @@ def _work(
 
 
 def _held(out: Path, grid: Grid) -> bool:
-    """Whether `out` holds this sweep already; BadInput if it holds something else."""
+    """Whether `out` holds this sweep already; BadInput if it holds another."""
     if out.exists() and not out.is_dir():
         raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
     if (out / "config.json").exists():
@@ -97,7 +96,7 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
     for indices in grid.groups():
         first = grid.points[indices[0]]
         env = tasks.environment(first.task)
-        tasks.check(env, first.learner, f"{path}: at {grids.said(first.place)}")
+        tasks.check(env, first.learner, f"{path}: at {grids.describe(first.coordinates)}")
         points = {i: member_inputs(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
         members = [
             Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
@@ -107,7 +106,7 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
         if not members_of.chunk_members(len(members), each, budget, workers):
             raise BadInput(
                 f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
-                f" (such as {grids.said(first.place)}) of which one for each worker"
+                f" (such as {grids.describe(first.coordinates)}) of which one for each worker"
                 f" needs {2 * each * workers / 1e9:.2g} GB"
             )
         groups.append(Group(trainer, members[process.number :: process.of]))
@@ -121,10 +120,10 @@ def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
 
 
 def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
-    """Run every group, and show how far it is: a line a chunk, and a bar in between."""
+    """Train every group with progress on the screen: a line a chunk, and a bar."""
     work = sum(len(group.members) * group.steps for group in groups)
     kept = members_of.finished(
-        out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are made anew")
+        out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are trained again")
     )
     mine = [group.steps for group in groups for member in group.members if member.number in kept]
     done = before = sum(mine)
@@ -135,9 +134,7 @@ def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[],
         spent = time.perf_counter() - began
         return clock(spent / (now - before) * (work - now)) if now > before else "–"
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        shown = bar.add_task("", total=work, completed=done, note="")
+    with progress_bar(work, done) as update:
         for number, group in enumerate(groups):
             under_way: dict[int, int] = {}
             for event in members_of.run(group, devices.workers(), budget, out / "chunks", stopped):
@@ -151,22 +148,22 @@ def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[],
                 else:
                     under_way[event.worker] = event.env_steps
                     now = done + sum(under_way.values())
-                    bar.update(shown, completed=now, note=f"{count} of {total} members, {left(now)} left")
+                    update(now, f"{count} of {total} members, ETA {left(now)}")
 
 
 def _line(event: ChunkDone, count: int, total: int, left: str) -> str:
-    sick = sum(bool(result.diverged) for result in event.results.values())
+    num_diverged = sum(bool(result.diverged) for result in event.results.values())
     return (
         f"{count:>6} of {total} members done, {clock(event.seconds)} for the last {len(event.results)},"
-        f" {left} left{f'; {sick} diverged' if sick else ''}"
+        f" ETA {left}{f'; {num_diverged} diverged' if num_diverged else ''}"
     )
 
 
 def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
-    """Every member's result, once all processes have made theirs; None if stopped before."""
+    """Every member's result, once all processes are done; None if stopped before."""
     found = members_of.finished(out / "chunks")
     if len(found) < total and process.of > 1 and not stopped():
-        console.print(f"process {process.number}: waiting for the others")
+        console.print(f"process {process.number}: waiting for the other processes")
     while len(found) < total and process.of > 1 and not stopped():
         time.sleep(POLL_SECONDS)
         found = members_of.finished(out / "chunks")
@@ -174,7 +171,7 @@ def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], 
 
 
 def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
-    findings = results.findings(grid, found)
+    findings = results.summaries(grid, found)
     results.write(out, grid, found, findings, seconds)
     _print_table(findings, len(grid.seeds))
     plot.sweep(out / "sweep.png", findings, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
@@ -191,7 +188,7 @@ def _ending(out: Path) -> int:
     """The exit code of a finished sweep, the first time and every other."""
     if (out / "best.json").exists():
         return DONE
-    complain(f"{out}: every member diverged; results.csv says where")
+    print_error(f"{out}: every member diverged; results.csv says where")
     return FAILED
 
 

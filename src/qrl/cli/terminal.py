@@ -1,4 +1,4 @@
-"""What every command needs of the terminal it runs in: where it writes, and when it is told to stop."""
+"""The terminal: exit codes, output, progress, and the request to stop."""
 
 import signal
 import sys
@@ -8,24 +8,42 @@ from typing import Any
 
 from rich.console import Console
 
+DONE, FAILED, WRONG_INPUT = 0, 1, 2
+
 console = Console(highlight=False, markup=False, soft_wrap=True)
 
 
+def print_error(message: str) -> None:
+    """One line on stderr."""
+    print(f"qrl: {' '.join(message.split())}", file=sys.stderr)
+
+
 @contextmanager
-def stop_requested(saying: str = "stopping: saving first") -> Iterator[Callable[[], bool]]:
-    """Whether Ctrl-C (or SIGTERM) came; a second Ctrl-C interrupts at once."""
-    asked = False
+def progress_bar(total: float, completed: float = 0.0) -> Iterator[Callable[[float, str], None]]:
+    """A bar on a terminal, and nothing elsewhere; yields a function that sets how much is completed, and a note."""
+    from rich.progress import BarColumn, Progress, TextColumn
 
-    def ask(number: int, _: Any) -> None:
-        nonlocal asked
-        if asked and number == signal.SIGINT:
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[note]}"))
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=total, completed=int(completed), note="")
+        yield lambda completed, note: bar.update(task, completed=completed, note=note)
+
+
+@contextmanager
+def stop_requested(message: str = "stopping: saving first") -> Iterator[Callable[[], bool]]:
+    """Yields whether Ctrl-C or SIGTERM came; a second Ctrl-C interrupts at once."""
+    requested = False
+
+    def handle(number: int, _: Any) -> None:
+        nonlocal requested
+        if requested and number == signal.SIGINT:
             raise KeyboardInterrupt
-        asked = True
-        console.print(saying)
+        requested = True
+        console.print(message)
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield lambda: requested
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
@@ -35,11 +53,3 @@ def clock(seconds: float) -> str:
     """Minutes and seconds."""
     minutes, seconds = divmod(round(seconds), 60)
     return f"{minutes}:{seconds:02d}"
-
-
-DONE, FAILED, WRONG_INPUT = 0, 1, 2
-
-
-def complain(message: str) -> None:
-    """Say what is wrong, in one line."""
-    print(f"qrl: {' '.join(message.split())}", file=sys.stderr)

@@ -43,6 +43,11 @@ class FlightPrograms:
         """The member's learner in NumPy, with the policy that is deployed."""
         return jax.tree.map(lambda x: np.asarray(x[0], np.float64), learners.deployed(self._setup.spec, learner))
 
+    def policy_mean(self, learner: LearnerState, observation: chex.Array) -> chex.Array:
+        """Mean action of the deployed policy; [..., F] -> [..., A]."""
+        one = learners.deployed(self._setup.spec, jax.tree.map(lambda x: x[0], learner))
+        return learners.policy_mean(self._setup.spec, self.config.hyperparameters, one, observation)
+
     def compile(self, env: Env, starts: chex.PRNGKey, executor: Executor) -> None:
         """Start compiling `fly` in `executor`."""
         kind = self._kind(env)

@@ -109,14 +109,25 @@ class TrainedRun:
             lambda env, keys: jax.vmap(partial(reset, env))(in_envelope, keys),
         )
 
+    def policy_mean(self, observation: chex.Array) -> chex.Array:
+        """The deployed policy's mean action as a pure JAX function; [..., F] -> [..., A]."""
+        return self._programs.policy_mean(self._learner, observation)
+
     def policy(self) -> Policy:
         """The policy to deploy, calibrated on observations of its own flights. BadInput without a control period."""
+        policy = self.float_policy()
+        starts = calibration_starts(calibration.STARTS)
+        flown = self.fly_host_policy(policy, starts, from_envelope=calibration.FROM_ENVELOPE)
+        return replace(policy, calibration=calibration.select(np.asarray(flown.observations[:, :-1])))
+
+    def float_policy(self) -> Policy:
+        """The policy as a value in SI units, without observations to calibrate on."""
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
         layers = deployed.params.policy["params"]
         size = len(deployed.statistics.mean)
         normalize = config.normalize_observations
         observations, actions = self._specs()
-        policy = Policy(
+        return Policy(
             provenance=Provenance(
                 run=self.folder.resolve().name,
                 task=self.config.task.name,
@@ -136,9 +147,6 @@ class TrainedRun:
             activation=config.activation,
             calibration=np.zeros((0, size), np.float32),
         )
-        starts = calibration_starts(calibration.STARTS)
-        flown = self.fly_host_policy(policy, starts, from_envelope=calibration.FROM_ENVELOPE)
-        return replace(policy, calibration=calibration.select(np.asarray(flown.observations[:, :-1])))
 
     def tail_steps(self) -> int:
         """Steps at the end of a flight in which success is measured."""

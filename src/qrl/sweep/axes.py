@@ -129,7 +129,7 @@ def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) 
     if all(isinstance(inner, dict) for inner in value.values()):
         if name in known:
             raise BadInput(f"{key}: expected another name for named settings than that of a setting")
-        _refuse_title(name, value, key)
+        _check_title(name, value, key)
         return Axis(tuple(value), value)
     span = specfile.build(Range, value, f"{where}: axes.{name}")
     if (span.count is None) != sampled:
@@ -140,28 +140,28 @@ def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) 
     return span
 
 
-def _refuse_title(name: str, settings: dict[str, Any], key: str) -> None:
+def _check_title(name: str, settings: dict[str, Any], key: str) -> None:
     if not name or "" in settings:
         raise BadInput(f'{key}: expected a name for {"each of its settings" if name else "the axis"}, found ""')
     if name in COLUMNS or name.startswith(MEASURES):
         raise BadInput(f"{key}: expected another name than that of a column of results.csv, found '{name}'")
 
 
-def refuse_clashes(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:
+def check_conflicts(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:
     """BadInput if a name is unknown, or set from two sides."""
     setters = dict.fromkeys(fixed, "fixed")
     for name in fixed:
-        _refuse_unknown(name, known, f"{where}: fixed")
+        _check_known(name, known, f"{where}: fixed")
     for title, values in axes.items():
         for name in values.names(title):
-            _refuse_unknown(name, known, f"{where}: axes")
+            _check_known(name, known, f"{where}: axes")
             if name in setters:
                 raise BadInput(f"{where}: key 'axes.{title}': '{name}' is set in '{setters[name]}' too")
             setters[name] = f"axes.{title}"
 
 
-def _refuse_unknown(name: str, known: list[str], where: str) -> None:
+def _check_known(name: str, known: list[str], where: str) -> None:
     if name.startswith(JUDGED):
-        raise BadInput(f"{where}: key '{name}': how a task is judged is the same for all points of a grid")
+        raise BadInput(f"{where}: key '{name}': how a task is evaluation_key is the same for all points of a grid")
     if name not in known:
         raise BadInput(f"{where}: unknown key '{name}'{specfile.nearest(name, known)}")

@@ -13,7 +13,7 @@ from pydantic import BeforeValidator, Field
 from qrl import tasks
 from qrl.config import Config, current_names
 from qrl.runs.record import TaskRecord
-from qrl.sweep.axes import Axis, Range, axis, put, refuse_clashes, settable
+from qrl.sweep.axes import Axis, Range, axis, check_conflicts, put, settable
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput, Count, CountOrZero, Spec
@@ -47,9 +47,9 @@ class GridFile(Spec):
 
 @dataclass(frozen=True)
 class GridPoint:
-    """One point: its place on the axes, and the run it stands for."""
+    """One point: its coordinates on the axes, and the run it stands for."""
 
-    place: dict[str, Any]  # axis -> value, or the name of an axis's settings
+    coordinates: dict[str, Any]  # axis -> value, or the name of an axis's settings
     task: TaskRecord
     learner: Config
 
@@ -62,7 +62,7 @@ class GridPoint:
         return json.dumps([self.task.name, fixed, form, self.learner.static], sort_keys=True)
 
     @property
-    def judged(self) -> dict[str, Any]:
+    def evaluation_key(self) -> dict[str, Any]:
         """How a report judges this point, as `evaluation()` of its environment and `fly` resolve it."""
         flights = {"number of flights (num_eval_envs)": self.learner.num_eval_envs}
         spec = self.task.spec
@@ -94,7 +94,7 @@ class Grid:
     def record(self) -> dict[str, Any]:
         """All that decides the results, for grid.json."""
         points = [
-            {"at": p.place, "task": p.task.model_dump(mode="json"), "learner": p.learner.model_dump(mode="json")}
+            {"at": p.coordinates, "task": p.task.model_dump(mode="json"), "learner": p.learner.model_dump(mode="json")}
             for p in self.points
         ]
         return {"format": 1, "grid": self.file.model_dump(mode="json"), "points": points}
@@ -117,7 +117,7 @@ def load(path: Path, budget_bytes: float) -> Grid:
     axes = {
         name: axis(name, value, known, str(path), sampled=file.sample is not None) for name, value in file.axes.items()
     }
-    refuse_clashes(file.fixed, axes, known, str(path))
+    check_conflicts(file.fixed, axes, known, str(path))
     count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
     reports = file.fixed.get("num_evals", tasks.task_preset(task, str(path))["num_evals"])
     kept = (
@@ -131,18 +131,18 @@ def load(path: Path, budget_bytes: float) -> Grid:
             f"{path}: expected a grid that fits into {budget_bytes / 1e9:g} GB of memory, found {count:,} points"
             f" × {len(file.seeds):,} seeds, which need {need / 1e9:,.1f} GB"
         )
-    places = _sampled(axes, file.sample, str(path)) if file.sample else _product(axes)
+    all_coordinates = _sampled(axes, file.sample, str(path)) if file.sample else _product(axes)
     points: dict[str, GridPoint] = {}
-    for place in places:
-        point = _point(task, file.fixed, axes, place, str(path))
+    for coordinates in all_coordinates:
+        point = _point(task, file.fixed, axes, coordinates, str(path))
         key = _in_single([point.task.spec, point.learner.model_dump(mode="json")])
         if key in points:
             raise BadInput(
-                f"{path}: expected each point once, found {said(place)} and {said(points[key].place)},"
-                " the same in single precision"
+                f"{path}: expected each point once, found {describe(coordinates)} and"
+                f" {describe(points[key].coordinates)}, the same in single precision"
             )
         points[key] = point
-        _refuse_other_judge(next(iter(points.values())), point, str(path))
+        _check_comparable(next(iter(points.values())), point, str(path))
     return Grid(file, axes, list(points.values()))
 
 
@@ -165,20 +165,20 @@ def _in_single(value: Any) -> str:
     return json.dumps(json.loads(json.dumps(value), parse_float=lambda text: float(np.float32(text))), sort_keys=True)
 
 
-def _refuse_other_judge(first: GridPoint, point: GridPoint, where: str) -> None:
-    """BadInput if two points are not judged alike: what they reach could not be compared."""
-    for name, value in first.judged.items():
-        if point.judged[name] != value:
+def _check_comparable(first: GridPoint, point: GridPoint, where: str) -> None:
+    """BadInput if two points are not evaluated alike: what they reach could not be compared."""
+    for name, value in first.evaluation_key.items():
+        if point.evaluation_key[name] != value:
             raise BadInput(
-                f"{where}: expected points that are judged alike, found another {name}"
-                f" at {said(first.place)} and at {said(point.place)}"
+                f"{where}: expected points that are evaluated alike, found another {name}"
+                f" at {describe(first.coordinates)} and at {describe(point.coordinates)}"
             )
 
 
-def said(place: dict[str, Any]) -> str:
+def describe(coordinates: dict[str, Any]) -> str:
     """A point in a line."""
     return ", ".join(
-        f"{name} {value if isinstance(value, str) else json.dumps(value)}" for name, value in place.items()
+        f"{name} {value if isinstance(value, str) else json.dumps(value)}" for name, value in coordinates.items()
     )
 
 
@@ -189,27 +189,27 @@ def _product(axes: dict[str, Any]) -> list[dict[str, Any]]:
 def _sampled(axes: dict[str, Axis | Range], sample: Sample, where: str) -> list[dict[str, Any]]:
     """Points drawn at random, each different from those before it."""
     rng = np.random.default_rng(sample.seed)
-    places: dict[str, dict[str, Any]] = {}
+    all_coordinates: dict[str, dict[str, Any]] = {}
     idle = 0  # draws since the last that was new; where one of n + 1 points is left, n draws in a row on average
-    while idle < 20 * len(places) + 1000:
-        place = {name: axis.draw(rng) for name, axis in axes.items()}
-        idle = 0 if places.setdefault(json.dumps(place), place) is place else idle + 1
-        if len(places) == sample.count:
-            return list(places.values())
+    while idle < 20 * len(all_coordinates) + 1000:
+        coordinates = {name: axis.draw(rng) for name, axis in axes.items()}
+        idle = 0 if all_coordinates.setdefault(json.dumps(coordinates), coordinates) is coordinates else idle + 1
+        if len(all_coordinates) == sample.count:
+            return list(all_coordinates.values())
     raise BadInput(
         f"{where}: key 'sample.count': expected no more points than the axes hold, found {sample.count:,};"
-        f" {len(places):,} different ones were drawn"
+        f" {len(all_coordinates):,} different ones were drawn"
     )
 
 
 def _point(
-    task: TaskRecord, fixed: dict[str, Any], axes: dict[str, Axis | Range], place: dict[str, Any], where: str
+    task: TaskRecord, fixed: dict[str, Any], axes: dict[str, Axis | Range], coordinates: dict[str, Any], where: str
 ) -> GridPoint:
     settings = dict(fixed)
-    for name, value in place.items():
+    for name, value in coordinates.items():
         settings |= axes[name].settings(name, value)
     learner = {name: value for name, value in settings.items() if not name.startswith("task.")}
-    where = f"{where}: at {said(place)}"
+    where = f"{where}: at {describe(coordinates)}"
     spec: Any = task.spec
     for name, value in settings.items():
         if name.startswith("task."):
@@ -217,4 +217,4 @@ def _point(
     if spec is not task.spec:
         checked = task_spec.from_data(spec, f"{where}: task").model_dump(mode="json", exclude_none=True)
         task = TaskRecord(name=task.name, spec=checked)
-    return GridPoint(place, task, specfile.build(Config, tasks.task_preset(task, where) | learner, where))
+    return GridPoint(coordinates, task, specfile.build(Config, tasks.task_preset(task, where) | learner, where))

@@ -37,7 +37,7 @@ def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
 
 def _label(grid: Grid, index: int) -> dict[str, Any]:
     point, seed = divmod(index, len(grid.seeds))
-    place = {name: _cell(value) for name, value in grid.points[point].place.items()}
+    place = {name: _cell(value) for name, value in grid.points[point].coordinates.items()}
     return {"point": point, **place, "seed": grid.seeds[seed]}
 
 
@@ -45,7 +45,7 @@ def _cell(value: Any) -> Any:
     return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
 
 
-def findings(grid: Grid, results: dict[int, Result]) -> list[Finding]:
+def summaries(grid: Grid, results: dict[int, Result]) -> list[Finding]:
     """For each point the quartiles over its seeds; a seed that diverged counts as the worst there could be."""
     measured = any(math.isfinite(row["success"]) for result in results.values() for row in result.rows[-1:])
     found = []
@@ -56,8 +56,8 @@ def findings(grid: Grid, results: dict[int, Result]) -> list[Finding]:
             for name in seeds[0].rows[-1]
             if name not in ("env_steps", "updates")
         }
-        sick = sum(bool(seed.diverged) for seed in seeds)
-        found.append({"point": i, "at": point.place, "seeds": len(seeds), "diverged": sick, **numbers})
+        num_diverged = sum(bool(seed.diverged) for seed in seeds)
+        found.append({"point": i, "at": point.coordinates, "seeds": len(seeds), "diverged": num_diverged, **numbers})
     return found
 
 
@@ -102,7 +102,7 @@ def ranked(found: list[Finding]) -> list[Finding]:
     return sorted(found, key=_rank, reverse=True)
 
 
-def repeat(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
+def best_run_config(grid: Grid, results: dict[int, Result], point: int) -> RunConfig:
     """The run of a point with its middle seed: the lower median, of those that did not diverge."""
     first = point * len(grid.seeds)
     last = {j: results[first + j].rows[-1] for j in range(len(grid.seeds)) if not results[first + j].diverged}
@@ -123,6 +123,6 @@ def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Finding
     files.replace_text(out / "curves.csv", files.csv_text(curves(grid, results)))
     winner = best(found, results, len(grid.seeds))
     if winner is not None:
-        files.write_json(out / "best.json", repeat(grid, results, winner).model_dump(mode="json"))
+        files.write_json(out / "best.json", best_run_config(grid, results, winner).model_dump(mode="json"))
     summary = {"best": winner, "programs": len(grid.groups()), "points": found, "command_seconds": round(seconds, 1)}
     files.write_json(out / "summary.json", summary)

@@ -88,7 +88,7 @@ class ChunkDone:
 
 def member_bytes(trainer: Trainer, point: MemberInputs) -> int:
     """What a member needs: its state, once more where the program writes it, and its flights."""
-    seeds, points = _like([Member(0, 0, point)], 1, None)
+    seeds, points = _abstract_inputs([Member(0, 0, point)], 1, None)
     states = jax.eval_shape(trainer.init, seeds, points)
     flights = jax.eval_shape(trainer.fly, states.learner, points, driver.report_starts(trainer.config))
     return 2 * _bytes(states) + _bytes(flights)
@@ -168,7 +168,7 @@ def _next(chunks: deque[list[Member]]) -> list[Member]:
     return []
 
 
-def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
+def _abstract_inputs(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
     """Shapes and types of the seeds and points of a chunk."""
     sharding = SingleDeviceSharding(device) if device else None
     points = jax.tree.map(
@@ -179,7 +179,7 @@ def _like(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
 
 def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, driver.Programs]:
     """The first state's program and the others, for chunks of `size` members."""
-    seeds, points = _like(members, size, device)
+    seeds, points = _abstract_inputs(members, size, device)
     states = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
         jax.eval_shape(trainer.init, seeds, points),
