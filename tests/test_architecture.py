@@ -58,6 +58,7 @@ ROOMS: dict[str, dict[str, Room]] = {
         "symmetry": Room({"quadrotor"}, MATHS),
         "controllers": Room({"task", "quadrotor", "rotation"}, MATHS | {"scipy"}),
         "env": Room({"task", "pendulum", "quadrotor", "rewards", "measures", "symmetry"}, MATHS | {"flax.struct"}),
+        "gymnasium_env": Room({"env", "task"}, MATHS | {"gymnasium"}),
         "perturbations": Room({"env", "task", "quadrotor", "rotation"}, MATHS),
         "viewer": Room({"task", "measures", "io_spec"}, MATHS | {"plotly"}),
         "plots": Room({"task", "measures"}, MATHS | {"matplotlib"}),

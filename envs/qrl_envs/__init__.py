@@ -1,6 +1,7 @@
-"""The worlds: a pendulum and a quadrotor as Brax environments. Importing registers them with Brax.
+"""A pendulum and a quadrotor as Brax environments, one for each task file in `tasks/`.
 
-Brax takes seconds to import and this asks for none of it: they are registered as soon as somebody imports `brax.envs`.
+`import qrl_envs` makes `brax.envs.get_environment("hover")` work. It does not import Brax, which takes seconds: the
+import hook below registers the tasks when `brax.envs` is imported, before or after.
 """
 
 import functools

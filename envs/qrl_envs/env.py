@@ -1,10 +1,10 @@
 """Tasks as Brax environments.
 
 `state.pipeline_state` is a `Lane`: the lane's own task (physics, reward weights, start ranges, bounds) travels
-with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` offers `restart` (a
-fresh start that keeps the lane's task), `with_params` (the same world with other parameters) and `evaluation`. An
-episode that ends early by leaving the bounds has `done = 1`, and `truncated = 1` and `out_of_bounds = 1` in `info`:
-whoever bootstraps should treat it as a truncation, and should not trust a value function there.
+with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` has `restart` (a new start
+that keeps the lane's task), `with_params`, `reset_calibration`, `symmetry` and `evaluation`. An episode that leaves
+the bounds ends with `done = 1`, and `truncated = 1` and `out_of_bounds = 1` in `info`: it is a truncation, but a value
+function has seen no state beyond the bounds, so a learner should not bootstrap from its value there.
 """
 
 import abc
@@ -23,7 +23,7 @@ from qrl_envs.task import PendulumTask, QuadrotorTask, Task
 
 
 class Params(NamedTuple):
-    """The task of one lane as a pytree; what of a task it holds is `task.TRACED`."""
+    """The parameters of one lane's task as a pytree: the parts of a task that `task.TRACED` names."""
 
     physics: Any
     reward: Any
@@ -39,7 +39,7 @@ class Lane(NamedTuple):
 
 
 class State(struct.PyTreeNode):
-    """`brax.envs.State`, field by field. Not that class itself, as Brax takes seconds to import."""
+    """A copy of `brax.envs.State`, because importing Brax takes seconds."""
 
     pipeline_state: Any
     obs: chex.Array  # [observation_size]
@@ -50,7 +50,7 @@ class State(struct.PyTreeNode):
 
 
 class Evaluation(NamedTuple):
-    """How a task is judged: fly `env` for `steps`, add up the first `return_steps` rewards, then `measure`."""
+    """How a task is evaluated: step `env` `steps` times, add up the first `return_steps` rewards, then `measure`."""
 
     env: "TaskEnv"
     steps: int
@@ -59,9 +59,9 @@ class Evaluation(NamedTuple):
 
 
 class TaskEnv(abc.ABC):
-    """A Brax environment made from a task; subclasses say what one world does.
+    """A Brax environment of a task; subclasses implement the physics.
 
-    An instance of `brax.envs.Env` wherever Brax has been imported: `import qrl_envs` sees to it.
+    Once Brax is imported, `qrl_envs` registers this class as a virtual subclass of `brax.envs.Env`.
     """
 
     def __init__(self, task: Task, params: Params, observation_size: int, action_size: int) -> None:
@@ -96,28 +96,28 @@ class TaskEnv(abc.ABC):
     differentiable = True  # step and reward
 
     def with_params(self, params: Params) -> "TaskEnv":
-        """This environment with other parameters of the same structure, which may be tracers."""
+        """A copy with other parameters of the same structure, which may be tracers."""
         other = copy.copy(self)
         other.params = params
         return other
 
     def reset(self, rng: chex.PRNGKey) -> State:
-        """A fresh start drawn with `rng` (a legacy or typed key)."""
-        return self._begin(self.params, rng)
+        """A random start drawn with `rng`, a legacy or typed key."""
+        return self._reset(self.params, rng)
 
     def reset_calibration(self, rng: chex.PRNGKey) -> State:
-        """A start from the envelope that a policy has to cope with once it leaves the simulator."""
+        """A random start from the task's `envelope`, the ranges that an exported policy is calibrated for."""
         return self.reset(rng)
 
     def restart(self, state: State, rng: chex.PRNGKey) -> State:
-        """A fresh start that keeps the task carried by `state`."""
-        return self._begin(state.pipeline_state.params, rng)
+        """A random start that keeps the task carried by `state`."""
+        return self._reset(state.pipeline_state.params, rng)
 
     def step(self, state: State, action: chex.Array) -> State:
-        """One control period under `action` in [−1, 1]ⁿ (values beyond are clipped)."""
+        """One control period under `action` [A], clipped to [−1, 1]."""
         lane: Lane = state.pipeline_state
         x, reward = self._advance(lane.params, lane.x, action)
-        done = self._fled(lane.params, x).astype(jnp.float32)
+        done = self._out_of_bounds(lane.params, x).astype(jnp.float32)
         return state.replace(
             pipeline_state=Lane(x, lane.params),
             obs=self._observe(x),
@@ -127,10 +127,10 @@ class TaskEnv(abc.ABC):
         )
 
     def symmetry(self, u: chex.Array) -> Symmetry:
-        """A random symmetry of the task, drawn with u [2], uniform in [0, 1)."""
+        """The random symmetry of the task that u [2] selects, uniform in [0, 1)."""
         return Symmetry(jnp.eye(self._sizes[0]), jnp.eye(self._sizes[1]))
 
-    def _begin(self, params: Params, rng: chex.PRNGKey) -> State:
+    def _reset(self, params: Params, rng: chex.PRNGKey) -> State:
         x = self._draw(params, rng)
         zero = jnp.float32(0.0)
         return State(
@@ -146,17 +146,22 @@ class TaskEnv(abc.ABC):
     @abc.abstractmethod
     def _observe(self, x: Any) -> chex.Array: ...
 
-    def _fled(self, params: Params, x: Any) -> chex.Array:
-        """Whether the episode ends here, before its last step; a bool []."""
+    def _out_of_bounds(self, params: Params, x: Any) -> chex.Array:
+        """Whether the episode ends early in state `x`; bool []."""
         return jnp.bool_(False)
 
     @abc.abstractmethod
     def evaluation(self) -> Evaluation:
-        """How DESIGN.md judges this task, whatever ranges and weights it trains with."""
+        """The evaluation that the task file defines; it does not depend on the ranges and weights of training."""
 
 
 class QuadrotorEnv(TaskEnv):
-    """Hover or circle. Observation [18] and action [4] as in DESIGN.md, "Frames, units, order"."""
+    """Hover or circle with a quadrotor.
+
+    Observation [18]: rotation matrix body -> world row-major, position [m] relative to the hover point or the circle's
+    centre and velocity [m/s] (world: x forward, y left, z up), body rates [rad/s] (body). Action [4]: a in [−1, 1] for
+    the motor thrusts clip(mg/4 + action_scale·a, 0, max) [N], in the order of the task's motors.
+    """
 
     task: QuadrotorTask
 
@@ -167,7 +172,7 @@ class QuadrotorEnv(TaskEnv):
         super().__init__(task, params, observation_size=18, action_size=4)
 
     def reset_calibration(self, rng: chex.PRNGKey) -> State:
-        return self._begin(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
+        return self._reset(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
 
     def _draw(self, params: Params, rng: chex.PRNGKey) -> quadrotor.Body:
         return quadrotor.draw(params.start, rng)
@@ -180,32 +185,32 @@ class QuadrotorEnv(TaskEnv):
     def _observe(self, x: quadrotor.Body) -> chex.Array:
         return quadrotor.observe(x)
 
-    def _fled(self, params: Params, x: quadrotor.Body) -> chex.Array:
-        near = jnp.linalg.norm(x.pose.position_m) <= params.bounds["distance_m"]
-        calm = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
-        return ~(near & calm)  # so that a NaN ends the episode too
+    def _out_of_bounds(self, params: Params, x: quadrotor.Body) -> chex.Array:
+        position_ok = jnp.linalg.norm(x.pose.position_m) <= params.bounds["distance_m"]
+        rate_ok = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
+        return ~(position_ok & rate_ok)  # negated, so that a NaN ends the episode too
 
     def symmetry(self, u: chex.Array) -> Symmetry:
-        circling = self.task.reward.form == "circle"
-        return (symmetry.circle if circling else symmetry.hover)(self.params.physics, u)
+        draw = symmetry.circle if self.task.reward.form == "circle" else symmetry.hover
+        return draw(self.params.physics, u)
 
     def evaluation(self) -> Evaluation:
         spec, dt_s = self.task.evaluation, self.task.control_period_s
-        judged = {"start": quadrotor.start(spec.start), "reward": rewards.from_spec(spec.reward)}
-        env = self.with_params(self.params._replace(**judged))
+        start, reward = quadrotor.start(spec.start), rewards.from_spec(spec.reward)
+        env = self.with_params(self.params._replace(start=start, reward=reward))
 
         def measure(observations: chex.Array) -> dict[str, chex.Array]:
             if spec.reward.form == "hover":
                 flight = measures.hover(observations, spec)
             else:
                 flight = measures.circle(observations, spec, spec.reward.radius_m, spec.reward.speed_m_s)
-            return measures.summarise(flight, round(spec.tail_s / dt_s), dt_s)
+            return measures.summarize(flight, round(spec.tail_s / dt_s), dt_s)
 
         return Evaluation(env, round(spec.duration_s / dt_s), spec.return_steps, measure)
 
 
 class PendulumEnv(TaskEnv):
-    """Pendulum-v1. Observation [cos θ, sin θ, θ̇], action [1]: torque/max_torque."""
+    """Gymnasium's Pendulum-v1. Observation [3]: cos θ, sin θ, θ̇ [rad/s]; action [1] in [−1, 1]: torque/max_torque."""
 
     task: PendulumTask
 
@@ -232,7 +237,7 @@ class PendulumEnv(TaskEnv):
         spec, dt_s = self.task.evaluation, self.task.control_period_s
 
         def measure(observations: chex.Array) -> dict[str, chex.Array]:
-            return measures.summarise(measures.pendulum(observations, spec), round(spec.tail_s / dt_s), dt_s)
+            return measures.summarize(measures.pendulum(observations, spec), round(spec.tail_s / dt_s), dt_s)
 
         params = self.params
         if spec.start:
@@ -248,5 +253,5 @@ def from_task(task: Task) -> TaskEnv:
 
 
 def make(name_or_path: str) -> TaskEnv:
-    """The Brax environment of a shipped task's name or of a task file; BadInput if there is none."""
+    """The Brax environment of a shipped task's name or of a task file; raises BadInput if there is none."""
     return from_task(tasks.load(name_or_path))

@@ -1,7 +1,7 @@
-"""Fixed-step integrators for second-order systems, apart from what they integrate.
+"""Fixed-step integrators for second-order systems.
 
-A state is a NamedTuple (pose, twist): a configuration and its rate, each any pytree. A derivative maps a
-state to a state of time derivatives; inputs and parameters are bound into it by the caller.
+A state is a NamedTuple (pose, twist): a configuration and its rate, each any pytree. A derivative maps a state to a
+state of time derivatives; the caller binds inputs and parameters into it.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ def _advance(x: Any, x_dot: Any, dt_s: float) -> Any:
 def semi_implicit_euler(
     derivative: Callable[[X], X], x: X, dt_s: float, limit: Callable[[Any], Any] = lambda twist: twist
 ) -> X:
-    """One step, first order: the twist first (then limited), then the pose with the new twist."""
+    """One step, first order: the twist first (then `limit`), then the pose with the new twist."""
     twist = limit(_advance(x.twist, derivative(x).twist, dt_s))
     return x._replace(pose=_advance(x.pose, derivative(x._replace(twist=twist)).pose, dt_s), twist=twist)
 

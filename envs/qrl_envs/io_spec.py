@@ -1,4 +1,4 @@
-"""What each number of an observation and an action means: name, unit, frame, and for actions the way to SI units."""
+"""Names, units and frames of a task's observations and actions, and the map from actions to SI units."""
 
 from typing import NamedTuple
 
@@ -6,28 +6,30 @@ from qrl_envs.task import STANDARD_GRAVITY_M_S2, QuadrotorTask, Task
 
 
 class ObservationPort(NamedTuple):
+    """One number of the observation."""
+
     name: str
-    unit: str
+    unit: str  # SI; "1": dimensionless
     frame: str
 
 
 class ActionPort(NamedTuple):
-    """clip(offset + scale·a, low, high), in `unit`, for a in [−1, 1]."""
+    """One number of the action: clip(offset + scale·a, low, high) in `unit`, for a in [−1, 1]."""
 
     name: str
-    unit: str
+    unit: str  # SI
     frame: str
-    offset: float
+    offset: float  # in `unit`, like the next four
     scale: float
     low: float
     high: float
-    safe: float  # hover thrust, no torque
-    position_m: tuple[float, float] | None = None  # motors: x, y in the body frame
-    spin: int | None = None  # motors: +1 where the reaction torque is positive about body z
+    safe: float  # command when an input is invalid: hover thrust, zero torque
+    position_m: tuple[float, float] | None = None  # of a motor: x, y in the body frame
+    spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
 
 
 def observations(task: Task) -> list[ObservationPort]:
-    """In the order of DESIGN.md, "Frames, units, order"."""
+    """The observation's numbers in order: 18 of a quadrotor (`env.QuadrotorEnv`), 3 of the pendulum."""
     if not isinstance(task, QuadrotorTask):
         angle = "angle from upright, positive counter-clockwise"
         return [
@@ -35,7 +37,7 @@ def observations(task: Task) -> list[ObservationPort]:
             ObservationPort("sin_theta", "1", angle),
             ObservationPort("theta_dot", "rad/s", angle),
         ]
-    what = "the hover point" if task.reward.form == "hover" else "the circle's centre"
+    origin = "the hover point" if task.reward.form == "hover" else "the circle's centre"
     rotation = [
         ObservationPort(f"r{i}{j}", "1", f"rotation matrix body -> world: world {axis} part of the body {other} axis")
         for i, axis in enumerate("xyz", 1)
@@ -43,17 +45,17 @@ def observations(task: Task) -> list[ObservationPort]:
     ]
     return [
         *rotation,
-        *(ObservationPort(f"p{axis}", "m", f"world: position from {what}") for axis in "xyz"),
+        *(ObservationPort(f"p{axis}", "m", f"world: position from {origin}") for axis in "xyz"),
         *(ObservationPort(f"v{axis}", "m/s", "world: velocity") for axis in "xyz"),
         *(ObservationPort(f"w{axis}", "rad/s", "body: angular rate") for axis in "xyz"),
     ]
 
 
 def actions(task: Task) -> list[ActionPort]:
-    """In the order of the task's motors."""
+    """The action's numbers: a quadrotor's motors in the order of its vehicle file, or the pendulum's torque."""
     if not isinstance(task, QuadrotorTask):
-        most = task.rod.max_torque_N_m
-        return [ActionPort("torque", "N m", "about the pivot, positive counter-clockwise", 0.0, most, -most, most, 0.0)]
+        limit, frame = task.rod.max_torque_N_m, "about the pivot, positive counter-clockwise"
+        return [ActionPort("torque", "N m", frame, offset=0.0, scale=limit, low=-limit, high=limit, safe=0.0)]
     vehicle = task.vehicle
     hover = vehicle.mass_kg * STANDARD_GRAVITY_M_S2 / 4.0
     return [

@@ -1,7 +1,7 @@
-"""How well a flight went: success, settle time, steady-state errors (DESIGN.md, "Evaluation").
+"""Measures of a flight: success, settle time, steady-state errors.
 
-For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps, or asks `of_flights` for many. A
-flight with a number that is not finite, in any observation, is a failure.
+For one flight: `observations` [K + 1, F] at times 0, dt, … K·dt; the caller vmaps. `of_flights` measures many flights.
+A flight with a non-finite observation is a failure.
 """
 
 import functools
@@ -16,9 +16,9 @@ from qrl_envs.task import CircleReward, FlightEvaluation, PendulumEvaluation, Pe
 
 
 class Errors(NamedTuple):
-    """Steady-state errors of one flight, by name, and where each sample is within the tolerances."""
+    """Errors of one flight over time, by name, and which samples are within the tolerances."""
 
-    finite: chex.Array  # [] bool: every observation of the flight is
+    finite: chex.Array  # [] bool: all observations are finite
     within: chex.Array  # [K + 1] bool
     errors: dict[str, chex.Array]  # name with unit -> [K + 1]
 
@@ -30,11 +30,11 @@ def hover(observations: chex.Array, tolerance: FlightEvaluation) -> Errors:
 
 
 def circle(observations: chex.Array, tolerance: FlightEvaluation, radius_m: float, speed_m_s: float) -> Errors:
-    """Radius error r − radius, height z, tangential speed (x·vy − y·vx)/r minus the wanted one."""
+    """Radius error r − radius_m [m], height z [m], tangential speed (x·vy − y·vx)/r − speed_m_s [m/s]."""
     x, y, z, vx, vy = (observations[:, i] for i in (9, 10, 11, 12, 13))
     r = jnp.hypot(x, y)
     speed = (x * vy - y * vx) / r - speed_m_s
-    assert tolerance.speed_m_s is not None  # the task file's validator saw to it
+    assert tolerance.speed_m_s is not None  # checked by the task file's validator
     within = (jnp.hypot(r - radius_m, z) < tolerance.distance_m) & (jnp.abs(speed) < tolerance.speed_m_s)
     return Errors(_finite(observations), within, {"radius_m": r - radius_m, "height_m": z, "speed_m_s": speed})
 
@@ -51,14 +51,14 @@ def _finite(observations: chex.Array) -> chex.Array:
 
 
 def settle_s(within: chex.Array, dt_s: float) -> chex.Array:
-    """First time [s] from which `within` [K + 1] holds to the end; infinite where it does not; []."""
+    """First time [s] from which `within` [K + 1] holds to the end; infinite if it does not hold at the end; []."""
     outside = ~within
     last_outside = within.shape[0] - 1 - jnp.argmax(outside[::-1])
     settled = jnp.where(jnp.any(outside), last_outside + 1, 0)
     return jnp.where(within[-1], settled * dt_s, jnp.inf)
 
 
-def summarise(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Array]:
+def summarize(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Array]:
     """{"success": 0 or 1, "settle_s", "rms_<error>"…} of one flight; its tail is the last `tail_steps` periods."""
     tail = {name: error[-(tail_steps + 1) :] for name, error in flight.errors.items()}
     rms = {f"rms_{name}": jnp.sqrt(jnp.mean(error**2)) for name, error in tail.items()}
@@ -70,15 +70,15 @@ def summarise(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Ar
 
 
 class Measured(NamedTuple):
-    """What n flights measure, in NumPy."""
+    """Measures of n flights, in NumPy."""
 
     errors: dict[str, np.ndarray]  # name with unit -> [n, K + 1]
     success: np.ndarray  # [n] bool
-    settle_s: np.ndarray  # [n]; infinite where it never settles
+    settle_s: np.ndarray  # [n]; infinite if it never settles
 
 
 def of_flights(task: Task, observations: np.ndarray) -> Measured:
-    """Errors, success and settle time of each of `observations` [n, K + 1, F], SI units, at times 0, dt, … K·dt."""
+    """Errors, success and settle time of flights with `observations` [n, K + 1, F] in SI units."""
     errors, summary = jax.tree.map(np.asarray, _of_flights(task, jnp.asarray(observations, jnp.float32)))
     return Measured(errors, summary["success"] > 0, summary["settle_s"])
 
@@ -89,64 +89,64 @@ def _of_flights(task: Task, observations: jax.Array) -> tuple[dict[str, jax.Arra
 
     def one(flight: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
         if isinstance(task, PendulumTask):
-            found = pendulum(flight, task.evaluation)
-        elif isinstance(wanted := task.evaluation.reward, CircleReward):
-            found = circle(flight, task.evaluation, wanted.radius_m, wanted.speed_m_s)
+            errors = pendulum(flight, task.evaluation)
+        elif isinstance(reward := task.evaluation.reward, CircleReward):
+            errors = circle(flight, task.evaluation, reward.radius_m, reward.speed_m_s)
         else:
-            found = hover(flight, task.evaluation)
-        return found.errors, summarise(found, round(task.evaluation.tail_s / dt_s), dt_s)
+            errors = hover(flight, task.evaluation)
+        return errors.errors, summarize(errors, round(task.evaluation.tail_s / dt_s), dt_s)
 
     return jax.vmap(one)(observations)
 
 
 def failed_starts(success: np.ndarray) -> list[int]:
-    """The indices of the flights that failed, for `success` [n], 0 or 1 each."""
+    """The indices of the failed flights, for `success` [n] of 0 or 1."""
     return [int(i) for i in np.flatnonzero(~(np.asarray(success) > 0))]
 
 
-def list_failures(task: Task, observations: np.ndarray, success: np.ndarray, most: int) -> list[dict[str, Any]]:
-    """Of the first `most` flights that failed: the index of the start, what it was, and why it failed.
+def list_failures(task: Task, observations: np.ndarray, success: np.ndarray, limit: int) -> list[dict[str, Any]]:
+    """For the first `limit` failed flights: the index of the start, the start, and the reason of the failure.
 
-    `observations` [n, K + 1, F] are NaN from where an episode ended early, as those of an evaluation are. Reasons:
-    "fled" or "tumbled" beyond the task's bounds, "did not settle" by the end, or "not finite".
+    `observations` [n, K + 1, F] are NaN after an episode's early end. Reasons: "fled" (beyond the bound of distance),
+    "tumbled" (of body rate), "did not settle", or "not finite".
     """
     return [
         {"start": i, **_start(task, observations[i, 0]), "reason": _reason(task, observations[i])}
-        for i in failed_starts(success)[:most]
+        for i in failed_starts(success)[:limit]
     ]
 
 
 def tilt_deg(observations: np.ndarray) -> np.ndarray:
-    """Angle between body z and world z [°] of a quadrotor's observations [..., 18]; [...]."""
+    """Angle between body z and world z [°], for a quadrotor's observations [..., 18]; [...]."""
     return np.degrees(np.arccos(np.clip(observations[..., 8], -1.0, 1.0)))
 
 
 def speed_m_s(observations: np.ndarray) -> np.ndarray:
-    """‖v‖ of a quadrotor's observations [..., 18]; [...]."""
+    """‖v‖ [m/s], for a quadrotor's observations [..., 18]; [...]."""
     return np.linalg.norm(observations[..., 12:15], axis=-1)
 
 
-def _start(task: Task, seen: np.ndarray) -> dict[str, Any]:
+def _start(task: Task, observation: np.ndarray) -> dict[str, Any]:
     if not isinstance(task, QuadrotorTask):
-        return {"angle_rad": float(np.arctan2(seen[1], seen[0])), "rate_rad_s": float(seen[2])}
+        return {"angle_rad": float(np.arctan2(observation[1], observation[0])), "rate_rad_s": float(observation[2])}
     return {
-        "tilt_deg": float(tilt_deg(seen)),
-        "speed_m_s": float(speed_m_s(seen)),
-        "position_m": [float(x) for x in seen[9:12]],
-        "velocity_m_s": [float(x) for x in seen[12:15]],
-        "body_rate_rad_s": [float(x) for x in seen[15:18]],
+        "tilt_deg": float(tilt_deg(observation)),
+        "speed_m_s": float(speed_m_s(observation)),
+        "position_m": [float(x) for x in observation[9:12]],
+        "velocity_m_s": [float(x) for x in observation[12:15]],
+        "body_rate_rad_s": [float(x) for x in observation[15:18]],
     }
 
 
-def _reason(task: Task, seen: np.ndarray) -> str:
-    over = np.flatnonzero(~np.isfinite(seen).all(axis=1))
-    if not len(over):
+def _reason(task: Task, observations: np.ndarray) -> str:
+    invalid = np.flatnonzero(~np.isfinite(observations).all(axis=1))
+    if not len(invalid):
         return "did not settle"
-    if not isinstance(task, QuadrotorTask) or not over[0]:
+    if not isinstance(task, QuadrotorTask) or not invalid[0]:
         return "not finite"
-    # The last that was seen is within the bounds; which of them it was about to leave, a step's motion tells.
-    last = seen[over[0] - 1]
-    ahead_m = np.linalg.norm(last[9:12] + task.control_period_s * last[12:15])
-    near_distance = ahead_m / task.bounds.distance_m
-    near_rate = np.linalg.norm(last[15:18]) / task.bounds.body_rate_rad_s
-    return "fled" if near_distance >= near_rate else "tumbled"
+    # The last valid observation is within the bounds; extrapolate it by one step to find which bound was left.
+    last = observations[invalid[0] - 1]
+    next_distance_m = np.linalg.norm(last[9:12] + task.control_period_s * last[12:15])
+    distance = next_distance_m / task.bounds.distance_m
+    rate = np.linalg.norm(last[15:18]) / task.bounds.body_rate_rad_s
+    return "fled" if distance >= rate else "tumbled"

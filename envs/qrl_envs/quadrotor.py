@@ -1,4 +1,4 @@
-"""The paper's quadrotor: gravity and motor thrust only (Sec. 5).  For one vehicle; the caller vmaps.
+"""The paper's quadrotor: a rigid body under gravity and motor thrust (Sec. 5). For one vehicle; the caller vmaps.
 
 World and body frames: x forward, y left, z up. Quaternions [w, x, y, z], body -> world.
 """
@@ -14,7 +14,7 @@ from qrl_envs.task import STANDARD_GRAVITY_M_S2, FlightStart, Vehicle
 
 
 class Physics(NamedTuple):
-    """Parameters as arrays, so that they batch and differentiate."""
+    """A vehicle's parameters as float32 arrays, so that they batch and differentiate."""
 
     mass_kg: chex.Array  # []
     inertia_kg_m2: chex.Array  # [3] principal, about body x, y, z
@@ -37,17 +37,22 @@ class Twist(NamedTuple):
 
 
 class Body(NamedTuple):
+    """The state of a rigid body."""
+
     pose: Pose
     twist: Twist
 
 
 class Start(NamedTuple):
-    position_m: chex.Array
-    velocity_m_s: chex.Array
-    body_rate_rad_s: chex.Array
+    """Half-widths of the uniform start ranges, about zero; scalars."""
+
+    position_m: chex.Array  # world
+    velocity_m_s: chex.Array  # world
+    body_rate_rad_s: chex.Array  # body
 
 
 def physics(vehicle: Vehicle) -> Physics:
+    """The parameters of a vehicle file."""
     return Physics(
         mass_kg=jnp.float32(vehicle.mass_kg),
         inertia_kg_m2=jnp.asarray(vehicle.inertia_kg_m2, jnp.float32),
@@ -61,27 +66,28 @@ def physics(vehicle: Vehicle) -> Physics:
 
 
 def start(ranges: FlightStart) -> Start:
+    """The start ranges of a task file."""
     return Start(*(jnp.float32(getattr(ranges, field)) for field in Start._fields))
 
 
 def hover_thrust_N(physics: Physics) -> chex.Array:
-    """F_o = mg/4, the offset force on each motor (paper, equ:forceOutput); []."""
+    """F_o = mg/4, each motor's thrust in hover [N] (paper, equ:forceOutput); []."""
     return physics.mass_kg * physics.gravity_m_s2 / 4.0
 
 
 def thrust_N(physics: Physics, action: chex.Array) -> chex.Array:
-    """F = clip(F_o + action_scale·a, 0, max) of each motor, for an action clipped to [−1, 1]; [4] -> [4]."""
-    wanted = hover_thrust_N(physics) + physics.action_scale_N * jnp.clip(action, -1.0, 1.0)
-    return jnp.clip(wanted, 0.0, physics.motor_max_N)
+    """F = clip(F_o + action_scale·a, 0, max) of each motor [N], for an action clipped to [−1, 1]; [4] -> [4]."""
+    command = hover_thrust_N(physics) + physics.action_scale_N * jnp.clip(action, -1.0, 1.0)
+    return jnp.clip(command, 0.0, physics.motor_max_N)
 
 
 def applied_action(physics: Physics, thrust: chex.Array) -> chex.Array:
-    """a = (F − F_o)/action_scale of the thrust F that was applied; [4] -> [4]. What rewards see."""
+    """The action of rewards: a = (F − F_o)/action_scale for the applied thrust F [N]; [4] -> [4]."""
     return (thrust - hover_thrust_N(physics)) / physics.action_scale_N
 
 
 def derivative(physics: Physics, body: Body, thrust: chex.Array) -> Body:
-    """d(body)/dt under gravity and the motors' thrust [4] [N] along body z (Newton–Euler; gyroscopic term kept)."""
+    """d(body)/dt under gravity and motor thrust [4] [N] along body z, by the Newton–Euler equations."""
     omega = body.twist.body_rate_rad_s
     x, y = physics.motor_position_m[:, 0], physics.motor_position_m[:, 1]
     torque = jnp.stack(
@@ -99,29 +105,31 @@ def derivative(physics: Physics, body: Body, thrust: chex.Array) -> Body:
 
 
 def step(physics: Physics, body: Body, thrust: chex.Array, dt_s: float) -> Body:
-    """One control period under constant thrust [4] [N]: velocities first, then the pose with the new ones."""
+    """One control period under constant thrust [4] [N], by semi-implicit Euler: twist first, then pose."""
     body = integrate.semi_implicit_euler(lambda b: derivative(physics, b, thrust), body, dt_s)
-    return body._replace(pose=body.pose._replace(attitude=rotation.normalise(body.pose.attitude)))
+    return body._replace(pose=body.pose._replace(attitude=rotation.normalize(body.pose.attitude)))
 
 
-def step_finely(physics: Physics, body: Body, thrust: chex.Array, dt_s: float, parts: int) -> Body:
-    """The same control period by RK4 in so many equal parts: closer to the true motion than `step`."""
+def step_rk4(physics: Physics, body: Body, thrust: chex.Array, dt_s: float, substeps: int) -> Body:
+    """One control period under constant thrust [4] [N], by RK4 in equal substeps: more accurate than `step`."""
 
-    def part(_: int, body: Body) -> Body:
-        body = integrate.rk4(lambda b: derivative(physics, b, thrust), body, dt_s / parts)
-        return body._replace(pose=body.pose._replace(attitude=rotation.normalise(body.pose.attitude)))
+    def substep(_: int, body: Body) -> Body:
+        body = integrate.rk4(lambda b: derivative(physics, b, thrust), body, dt_s / substeps)
+        return body._replace(pose=body.pose._replace(attitude=rotation.normalize(body.pose.attitude)))
 
-    return jax.lax.fori_loop(0, parts, part, body)
+    return jax.lax.fori_loop(0, substeps, substep, body)
 
 
 def observe(body: Body) -> chex.Array:
-    """[18]: rotation matrix body -> world row-major, position [m], velocity [m/s] (world), body rates [rad/s]."""
+    """The observation [18]: rotation matrix body -> world row-major, position [m] and
+    velocity [m/s] (world), body rates [rad/s].
+    """
     return jnp.concatenate([rotation.matrix(body.pose.attitude).reshape(9), body.pose.position_m, *body.twist])
 
 
 def draw(start: Start, key: chex.PRNGKey) -> Body:
-    """A fresh start: attitude uniform over SO(3), every other coordinate uniform within ± its range."""
-    u = jax.random.uniform(key, (4, 3))  # one draw: random draws dominate the compile time of a reset
+    """A random start: attitude uniform over SO(3), every other coordinate uniform within ± its range."""
+    u = jax.random.uniform(key, (4, 3))  # one draw, because random draws dominate the compile time of a reset
     position, velocity, rate = 2.0 * u[1:] - 1.0
     return Body(
         Pose(start.position_m * position, rotation.uniform(u[0])),

@@ -1,4 +1,4 @@
-"""Rewards of the paper's form (Sec. 5) and Pendulum-v1's.  For one state; the caller vmaps."""
+"""Rewards of the paper (Sec. 5) and of Gymnasium's Pendulum-v1. For one state; the caller vmaps. All return []."""
 
 from typing import NamedTuple
 
@@ -19,9 +19,9 @@ class Hover(NamedTuple):
     w3_action: chex.Array
 
     def __call__(self, body: Body, action: chex.Array) -> chex.Array:
-        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) on the state after the step, with the action [4] as applied.
+        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) of the state after the step and the applied action [4].
 
-        q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, one attitude, cost the same.
+        q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, the same attitude, cost the same.
         """
         q = body.pose.attitude
         q_e = jnp.concatenate([1.0 - jnp.abs(q[:1]), q[1:]])
@@ -44,7 +44,7 @@ class Circle(NamedTuple):
     speed_m_s: chex.Array
 
     def __call__(self, body: Body, action: chex.Array) -> chex.Array:
-        """constant − (w4·d + w5·|chi| + w6·‖a‖) on the state after the step, with the action [4] as applied.
+        """constant − (w4·d + w5·|chi| + w6·‖a‖) of the state after the step and the applied action [4].
 
         d is the distance to the circle and chi = x·vy − y·vx − r_des·v_des (paper, Sec. 5.3).
         """
@@ -65,7 +65,7 @@ class SwingUp(NamedTuple):
     w_torque_1_N2m2: chex.Array
 
     def __call__(self, x: Pendulum, torque: chex.Array) -> chex.Array:
-        """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²), θ wrapped to ±π, on the state before the step."""
+        """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²), θ wrapped to ±π, of the state before the step."""
         theta = jnp.mod(x.pose + jnp.pi, 2.0 * jnp.pi) - jnp.pi
         return -(self.w_angle_1_rad2 * theta**2 + self.w_rate_s2_rad2 * x.twist**2 + self.w_torque_1_N2m2 * torque**2)
 
@@ -74,6 +74,6 @@ _FORMS = {"hover": Hover, "circle": Circle, "pendulum": SwingUp}
 
 
 def from_spec(spec: HoverReward | CircleReward | PendulumReward) -> Hover | Circle | SwingUp:
-    """The reward that a task file describes, its weights as arrays."""
+    """The reward of a task file, with its weights as float32 arrays."""
     kind = _FORMS[spec.form]
     return kind(*(jnp.float32(getattr(spec, field)) for field in kind._fields))

@@ -1,4 +1,4 @@
-"""Unit quaternions [w, x, y, z], body -> world.  For one quaternion; the caller vmaps."""
+"""Unit quaternions [w, x, y, z], body -> world. For one quaternion; the caller vmaps."""
 
 import chex
 import jax
@@ -24,7 +24,7 @@ def derivative(q: chex.Array, body_rate: chex.Array) -> chex.Array:
     return 0.5 * product(q, jnp.concatenate([jnp.zeros_like(body_rate[:1]), body_rate]))
 
 
-def normalise(q: chex.Array) -> chex.Array:
+def normalize(q: chex.Array) -> chex.Array:
     """q/‖q‖; [4] -> [4]."""
     return q * jax.lax.rsqrt(jnp.sum(jnp.square(q)))
 

@@ -1,6 +1,6 @@
-"""Strict JSON specifications: one clear line for every way a file or flag can be wrong.
+"""Strict JSON specifications, with an error message of one line for every invalid file or flag.
 
-The pydantic models of tasks and learner presets derive from `Spec`; `read` and `build` turn a file into one.
+The pydantic models of tasks and presets derive from `Spec`; `read` and `build` turn a file into one.
 """
 
 import difflib
@@ -14,48 +14,48 @@ LONGEST_MESSAGE = 900  # characters
 
 
 class BadInput(ValueError):
-    """The user's input is wrong. The message is one line: where, which key, what was expected."""
+    """Invalid user input. The message is one line: file or flag, key, and what was expected."""
 
     def __init__(self, message: str) -> None:
-        # Keys and values may hold line breaks and the terminal's control codes, and be long.
+        # Keys and values may contain line breaks and terminal control codes, and be long.
         line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
         super().__init__(line if len(line) <= LONGEST_MESSAGE else line[: LONGEST_MESSAGE - 1] + "…")
 
 
 class Spec(BaseModel):
-    """A frozen record read from JSON: no unknown keys, no coercion between types, only finite numbers."""
+    """A frozen model of JSON: no unknown keys, no coercion between types, only finite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
-def _whole(value: Any) -> Any:
+def _as_int(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _single(value: float) -> float:
+def _fits_float32(value: float) -> float:
     if value and not 1e-30 <= abs(value) <= 1e30:
         raise ValueError(f"expected a magnitude that single precision holds (1e-30 to 1e30), found {value}")
     return value
 
 
-Real = Annotated[float, AfterValidator(_single)]
-Positive = Annotated[float, Field(gt=0), AfterValidator(_single)]
-NonNegative = Annotated[float, Field(ge=0), AfterValidator(_single)]
-Fraction = Annotated[float, Field(ge=0, le=1), AfterValidator(_single)]
-Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, lt=2**31)]  # accepts 2e6
-CountOrZero = Annotated[int, BeforeValidator(_whole), Field(ge=0, lt=2**31)]
+Real = Annotated[float, AfterValidator(_fits_float32)]
+Positive = Annotated[float, Field(gt=0), AfterValidator(_fits_float32)]
+NonNegative = Annotated[float, Field(ge=0), AfterValidator(_fits_float32)]
+Fraction = Annotated[float, Field(ge=0, le=1), AfterValidator(_fits_float32)]
+Count = Annotated[int, BeforeValidator(_as_int), Field(ge=1, lt=2**31)]  # accepts 2e6
+CountOrZero = Annotated[int, BeforeValidator(_as_int), Field(ge=0, lt=2**31)]
 
 T = TypeVar("T")
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """' (did you mean …?)' with the known word nearest to `word`, or the list of them all."""
+    """' (did you mean …?)' with the closest known word, or the list of all known words."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
     return f" (did you mean '{close[0]}'?)" if close else f" (known: {', '.join(sorted(known))})"
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The JSON object in the file at `path`; BadInput if unreadable, not JSON, not an object, or a key stands twice."""
+    """The JSON object in a file; raises BadInput if it is unreadable, not JSON, not an object, or repeats a key."""
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         data: dict[str, Any] = {}
@@ -73,7 +73,7 @@ def read(path: Path) -> dict[str, Any]:
         raise BadInput(f"{path}: line {error.lineno}, column {error.colno}: not JSON ({error.msg})") from None
     except BadInput:
         raise
-    except (ValueError, RecursionError):  # not UTF-8, a number of thousands of digits, nested without end
+    except (ValueError, RecursionError):  # not UTF-8, a number of thousands of digits, nested too deep
         raise BadInput(f"{path}: not JSON that can be read") from None
     if not isinstance(data, dict):
         raise BadInput(f"{path}: expected a JSON object, found {type(data).__name__}")
@@ -81,10 +81,7 @@ def read(path: Path) -> dict[str, Any]:
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
-    """`base` with the keys of `over` laid on top.
-
-    Objects merge key by key, but an object of another "form" replaces the old one; so does everything else.
-    """
+    """`base` with the keys of `over`: objects merge recursively, unless their "form" differs; other values replace."""
     merged = dict(base)
     for key, value in over.items():
         old = base.get(key)
@@ -96,7 +93,7 @@ def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:
 
 
 def build(kind: type[T] | Any, data: dict[str, Any], where: str) -> T:
-    """`data` as a value of the pydantic model (or annotated union) `kind`; BadInput names `where` and the key."""
+    """Validates `data` as the pydantic model or annotated union `kind`; BadInput names `where` and the key."""
     adapter: TypeAdapter[T] = TypeAdapter(kind)
     try:
         return adapter.validate_json(json.dumps(data))
@@ -105,7 +102,7 @@ def build(kind: type[T] | Any, data: dict[str, Any], where: str) -> T:
 
 
 def _first_line(error: ValidationError, kind: Any) -> str:
-    # A misspelt key is the likelier cause than the key then missing, so it is named first.
+    # A misspelled key also leaves the intended one missing; report the misspelling.
     problem = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
     model, path = _follow(kind, problem["loc"])
     context = problem.get("ctx", {})
@@ -118,7 +115,7 @@ def _first_line(error: ValidationError, kind: Any) -> str:
         return f"unknown key '{key}'{nearest(path[-1], _names(model)) if model else ''}"
     if problem["type"] == "missing":
         return f"key '{key}' is missing"
-    if problem["type"] == "value_error":  # our own validators say what they found themselves
+    if problem["type"] == "value_error":  # from our validators, whose messages are complete
         return f"key '{key}': {context['error']}" if key else str(context["error"])
     found = json.dumps(problem["input"], default=str)
     message = problem["msg"].replace("Input should be", "expected").replace("Input should have", "expected")
@@ -127,7 +124,7 @@ def _first_line(error: ValidationError, kind: Any) -> str:
 
 
 def _names(model: type[BaseModel]) -> list[str]:
-    """Its keys as a file writes them."""
+    """A model's keys in a file."""
     return [field.alias or name for name, field in model.model_fields.items()]
 
 
@@ -138,7 +135,7 @@ def _models(kind: Any) -> list[type[BaseModel]]:
 
 
 def _follow(kind: Any, loc: tuple[int | str, ...]) -> tuple[type[BaseModel] | None, list[str]]:
-    """The innermost model that `loc` points into and the key's path as the user wrote it (union tags left out)."""
+    """The innermost model at a pydantic error's `loc`, and the key's path in the file, without union tags."""
     models, path, inner = _models(kind), [], None
     for part in loc:
         field = next((m for m in models if isinstance(part, str) and part in m.model_fields), None)

@@ -1,7 +1,7 @@
-"""A task is data: what flies, how it starts, what is rewarded, when it ends and how it is judged.
+"""Tasks as data: vehicle, start ranges, bounds, reward and evaluation.
 
-`load` reads a shipped task by name or a `.json` that may `extend` one. Units are in the names; frames are
-DESIGN.md's (world and body: x forward, y left, z up).
+`load` reads a shipped task by name, or a `.json` that may `extend` one. Units are in the names. World and body frames:
+x forward, y left, z up.
 """
 
 from importlib import resources
@@ -50,26 +50,26 @@ STANDARD_GRAVITY_M_S2 = 9.81
 
 
 class FlightStart(Spec):
-    """Ranges of a uniform draw, each coordinate in ±range; the attitude is uniform over SO(3)."""
+    """Start ranges: each coordinate is uniform in ±range, the attitude uniform over SO(3)."""
 
     position_m: NonNegative  # from the hover point or the circle's centre
     velocity_m_s: NonNegative
     body_rate_rad_s: NonNegative
 
 
-# Wide enough for the paper's trial, which began at 6.7 m/s (its figure of a hovering trial).
+# Includes the paper's trial, which started at 6.7 m/s (its figure of a hovering trial).
 ENVELOPE = FlightStart(position_m=2.0, velocity_m_s=7.0, body_rate_rad_s=1.0)
 
 
 class Bounds(Spec):
-    """Beyond these an episode ends early, as a truncation."""
+    """An episode beyond these bounds ends early, as a truncation."""
 
     distance_m: Positive
     body_rate_rad_s: Positive
 
 
 class HoverReward(Spec):
-    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖), the paper's form."""
+    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) (paper, Sec. 5)."""
 
     form: Literal["hover"]
     constant: Real = 0.0
@@ -79,7 +79,7 @@ class HoverReward(Spec):
 
 
 class CircleReward(Spec):
-    """constant − (w4·d + w5·|chi| + w6·‖a‖), the paper's form."""
+    """constant − (w4·d + w5·|chi| + w6·‖a‖) (paper, Sec. 5.3)."""
 
     form: Literal["circle"]
     constant: Real = 0.0
@@ -102,7 +102,7 @@ class FlightEvaluation(Spec):
     distance_m: Positive  # from the hover point, or from the circle
     speed_m_s: Positive | None = None  # circle only: |tangential speed − reward's speed|
     start: FlightStart
-    reward: FlightReward  # what `return` adds up, over the flight's first `return_steps`
+    reward: FlightReward  # added up over the first `return_steps` of the flight
 
     @model_validator(mode="after")
     def _consistent(self) -> "FlightEvaluation":
@@ -133,16 +133,16 @@ class QuadrotorTask(Spec):
     episode_steps: Count
     vehicle: Vehicle
     start: FlightStart
-    envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for, whatever it trained on
+    envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
     bounds: Bounds
     reward: FlightReward
     evaluation: FlightEvaluation
 
     @model_validator(mode="after")
     def _consistent(self) -> "QuadrotorTask":
-        wanted, judged = self.reward, self.evaluation.reward
+        train, evaluation = self.reward, self.evaluation.reward
         for name in ("form", "radius_m", "speed_m_s"):
-            if getattr(wanted, name, None) != getattr(judged, name, None):
+            if getattr(train, name, None) != getattr(evaluation, name, None):
                 raise ValueError(f"expected reward.{name} and evaluation.reward.{name} to be the same")
         return _periods_fit(self)
 
@@ -153,7 +153,7 @@ class PendulumStart(Spec):
 
 
 class PendulumReward(Spec):
-    """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²), Gymnasium's form, on the state before the step."""
+    """−(w_angle·θ² + w_rate·θ̇² + w_torque·u²) of the state before the step, as in Pendulum-v1."""
 
     form: Literal["pendulum"]
     w_angle_1_rad2: NonNegative
@@ -177,7 +177,7 @@ class PendulumEvaluation(Spec):
     angle_rad: Positive
     rate_rad_s: Positive
     start: PendulumStart | None = None  # null: as in training
-    reward: PendulumReward | None = None  # what `return` adds up; null: as in training
+    reward: PendulumReward | None = None  # added up over the flight; null: as in training
 
 
 class PendulumTask(Spec):
@@ -198,13 +198,13 @@ class PendulumTask(Spec):
 
 Task = QuadrotorTask | PendulumTask
 
-# What of a task is numbers that a compiled program takes as arguments (env.Params); all else shapes the program.
+# The fields whose numbers are arguments of a compiled program (env.Params); the other fields shape the program.
 TRACED = ("vehicle", "rod", "start", "bounds", "reward")
 _ANY_TASK = Annotated[Task, Field(discriminator="world")]
 
 
 def shipped() -> list[str]:
-    """Names of the tasks that come with the package."""
+    """Names of the shipped tasks."""
     return sorted(
         entry.name.removesuffix(".json")
         for entry in resources.files("qrl_envs").joinpath("tasks").iterdir()
@@ -217,7 +217,7 @@ def _shipped(name: str) -> dict[str, Any]:
 
 
 def load(name_or_path: str) -> Task:
-    """The task of a shipped name, or of a path to a `.json`; BadInput says in one line what is wrong."""
+    """The task of a shipped name or of a `.json` file; raises BadInput with a message of one line."""
     if name_or_path in shipped():
         return specfile.build(_ANY_TASK, _shipped(name_or_path), name_or_path)
     if name_or_path.endswith(".json"):
@@ -226,12 +226,12 @@ def load(name_or_path: str) -> Task:
 
 
 def from_data(data: dict[str, Any], where: str) -> Task:
-    """The task of a JSON object that may `extend` a shipped task; `where` names its origin in errors."""
+    """The task of a JSON object, which may `extend` a shipped task; error messages begin with `where`."""
     return specfile.build(_ANY_TASK, extended(data, where), where)
 
 
 def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """`data` laid over the shipped task that its key `extend` names, if it names one."""
+    """`data` merged over the shipped task that its key `extend` names, if any."""
     if "extend" not in data:
         return data
     base = data["extend"]

@@ -29,7 +29,7 @@ from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED, Run
 from qrl.runs import files
 from qrl_envs import measures, viewer
 from qrl_envs import task as tasks
-from qrl_envs.viewer import Flown
+from qrl_envs.viewer import Recording
 
 Array = np.ndarray
 Build = Callable[[str], Path]
@@ -48,7 +48,7 @@ def rotations(angle: Array, axis: Array) -> Array:
     return np.eye(3) + s * k + (1 - c) * k @ k
 
 
-def made_up(name: str, n: int = 3, seed: int = 0) -> Flown:
+def made_up(name: str, n: int = 3, seed: int = 0) -> Recording:
     """Flights as long as an evaluation's that approach the wanted motion; actions are noise, some beyond ±1."""
     task, rng = tasks.load(name), np.random.default_rng(seed)
     steps = round(task.evaluation.duration_s / task.control_period_s)
@@ -66,7 +66,7 @@ def made_up(name: str, n: int = 3, seed: int = 0) -> Flown:
         observations = np.concatenate([attitude, position, np.gradient(position, t, axis=1), rate], -1)
     actions = rng.normal(size=(n, steps, 1 if name == "pendulum" else 4)).clip(-1.0, 1.0)
     starts = [*STARTS, *range(1, 1000)][:n]
-    return Flown(starts, observations.astype(np.float32), actions.astype(np.float32))
+    return Recording(starts, observations.astype(np.float32), actions.astype(np.float32))
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def test_motors_are_told_apart_by_their_place() -> None:
     assert len({motor["colour"] for motor in motors}) == 4
     for motor, line in zip(motors, lines, strict=True):
         x, y = motor["position_m"]
-        assert line["says"] == f"the {'front' if x > 0 else 'rear'} {'left' if y > 0 else 'right'} motor"
+        assert line["description"] == f"the {'front' if x > 0 else 'rear'} {'left' if y > 0 else 'right'} motor"
         assert line["name"].endswith({(1, 1): "↖", (-1, 1): "↙", (-1, -1): "↘", (1, -1): "↗"}[np.sign(x), np.sign(y)])
         assert (motor["colour"] in viewer.FRONT) == (x > 0)
 
@@ -151,7 +151,7 @@ def test_a_page_of_any_size_is_small(name: str) -> None:
     data = data_of(page)
     stride = round(data["period_s"] / tasks.load(name).control_period_s)
     samples = flown.observations.shape[1]
-    assert stride == -(-50 * samples // viewer.SAMPLES_AT_MOST)
+    assert stride == -(-50 * samples // viewer.MAX_SAMPLES)
     assert [len(flight["panels"][0][0]) for flight in data["flights"]] == [-(-samples // stride)] * 50
     assert data["flights"][0]["samples"] == -(-samples // stride)
 

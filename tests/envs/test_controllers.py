@@ -74,8 +74,8 @@ def recovered(name: str) -> Flights:
 
 
 @functools.cache
-def motion(name: str) -> lqr.Linear:
-    return lqr.linearised({"hover": HOVER, "circle": CIRCLE}[name])
+def motion(name: str) -> lqr.LinearModel:
+    return lqr.linearize({"hover": HOVER, "circle": CIRCLE}[name])
 
 
 @functools.cache
@@ -86,7 +86,7 @@ def regulator(name: str) -> Array:
 @functools.cache
 def controller(kind: str, name: str) -> Controller:
     if kind == "lqr":
-        return jax.jit(lqr.following(motion(name).wanted, regulator(name).astype(np.float32)))
+        return jax.jit(lqr.state_feedback(motion(name).trim, regulator(name).astype(np.float32)))
     return jax.jit(geometric.controller({"hover": HOVER, "circle": CIRCLE}[name]))
 
 
@@ -159,17 +159,17 @@ def test_lqr_on_the_circle_knows_no_phase() -> None:
         )
 
 
-def stepped(wanted: lqr.Wanted, circling: bool, error: Array, action: Array) -> Array:
-    """The error [12] after a step of the world, by SciPy, in float64; `action` [4] is beside the wanted one."""
+def stepped(trim: lqr.Trim, circling: bool, error: Array, action: Array) -> Array:
+    """The error [12] after a step of the world, by SciPy, in float64; `action` [4] is added to the trim's."""
     position, velocity, turn, rate = np.split(error, 4)
-    p, v, q, w, a = (np.asarray(x, np.float64) for x in wanted)
+    p, v, q, w, a = (np.asarray(x, np.float64) for x in trim)
     attitude = Rotation.from_quat(np.roll(q, -1)) * Rotation.from_rotvec(turn)
     vehicle = jax.tree.map(lambda x: np.asarray(x, np.float64), quadrotor.physics(HOVER.vehicle))
     thrust = 0.667 * 9.81 / 4 + 6.0 * (a + action)
     flat = np.concatenate([p + position, v + velocity, w + rate, attitude.as_matrix().ravel()])
     change = newton_euler(vehicle, thrust)(0.0, flat)
     velocity, rate = v + velocity + DT_S * change[3:6], w + rate + DT_S * change[6:9]
-    # A quaternion q + dt/2·q⊗ω, normalised, turns by 2·atan(dt/2·|ω|) about ω.
+    # A quaternion q + dt/2·q⊗ω, normalized, turns by 2·atan(dt/2·|ω|) about ω.
     by = 2.0 * np.arctan(DT_S / 2 * np.linalg.norm(rate)) * rate / max(np.linalg.norm(rate), 1e-12)
     position, attitude = p + position + DT_S * velocity, attitude * Rotation.from_rotvec(by)
     if circling:
@@ -181,10 +181,10 @@ def stepped(wanted: lqr.Wanted, circling: bool, error: Array, action: Array) -> 
 
 @pytest.mark.parametrize("name", ["hover", "circle"])
 def test_lqr_is_scipys_of_finite_differences(name: str) -> None:
-    """What is wanted stays as it is; a step's numerical derivatives, the gain from them, and a stable loop."""
+    """The trim is a fixed point; a step's numerical derivatives, the gain from them, and a stable loop."""
     linear, circling, h = motion(name), name == "circle", 1e-5
     kept = np.delete(np.arange(12), [1] if circling else [])
-    step = functools.partial(stepped, linear.wanted, circling)
+    step = functools.partial(stepped, linear.trim, circling)
     np.testing.assert_allclose(step(np.zeros(12), np.zeros(4))[kept], 0.0, atol=2e-6)
     derivative = np.stack(
         [(step(e[:12], e[12:]) - step(-e[:12], -e[12:]))[kept] / (2 * h) for e in h * np.eye(16)], axis=1
@@ -218,7 +218,7 @@ def wrench(thrust: Array) -> Array:
 
 
 @pytest.mark.parametrize(
-    ("asked", "leeway_N", "given"),
+    ("asked", "lift_error_N", "given"),
     [
         ((2.0, 0.1, -0.2, 0.01), 0.0, (2.0, 0.1, -0.2, 0.01)),  # all of it
         ((100.0, 0.0, 0.0, 0.0), 0.0, (24.0, 0.0, 0.0, 0.0)),  # what there is
@@ -228,10 +228,10 @@ def wrench(thrust: Array) -> Array:
         ((0.0, 0.2, 0.0, 1.0), 0.0, (0.0, 0.2, 0.0, 0.016 * (4 * 1.635675 - 0.2 / 0.07425))),  # heading last
     ],
 )
-def test_motors_do_what_they_can(asked: tuple[float, ...], leeway_N: float, given: tuple[float, ...]) -> None:
+def test_motors_do_what_they_can(asked: tuple[float, ...], lift_error_N: float, given: tuple[float, ...]) -> None:
     """Lift above hover [N], torque about x, y, z [N m]: asked of the mixer, and given by the thrusts it commands."""
     motors = mixer.mixer(HOVER.vehicle)
-    action = np.asarray(mixer.action(motors, jnp.float32(asked[0]), jnp.asarray(asked[1:]), leeway_N), np.float64)
+    action = np.asarray(mixer.action(motors, jnp.float32(asked[0]), jnp.asarray(asked[1:]), lift_error_N), np.float64)
     got = wrench(0.667 * 9.81 / 4 + 6.0 * action)
     np.testing.assert_allclose(got - [0.667 * 9.81, 0, 0, 0], given, atol=2e-3)
 
@@ -239,7 +239,7 @@ def test_motors_do_what_they_can(asked: tuple[float, ...], leeway_N: float, give
 def test_failures_are_those_that_fail_again() -> None:
     """Of the LQR's flights: listed with the start that it was; flown alone, in another order, each fails again."""
     n = 96
-    fly = flyer(HOVER, lqr.following(motion("hover").wanted, regulator("hover").astype(np.float32)))
+    fly = flyer(HOVER, lqr.state_feedback(motion("hover").trim, regulator("hover").astype(np.float32)))
     flights = jax.tree.map(np.asarray, fly(keys(n)))
     found = measures.list_failures(HOVER, flights.observations, flights.measures["success"], 50)
     index = [each["start"] for each in found]

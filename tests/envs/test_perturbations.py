@@ -75,12 +75,12 @@ def test_without_a_difference_it_is_the_tasks_own_world() -> None:
     for name in ("obs", "reward", "done"):
         np.testing.assert_array_equal(getattr(theirs, name), getattr(ours, name))
     jax.tree.map(np.testing.assert_array_equal, theirs.pipeline_state.x, ours.pipeline_state.x)
-    np.testing.assert_allclose(ours.info["sensed"], ours.obs, atol=1e-6)
+    np.testing.assert_allclose(ours.info["sensor_obs"], ours.obs, atol=1e-6)
 
 
 def test_rk4_flies_the_true_motion() -> None:
     """Tumbling at 9 rad/s for 0.4 s under a thrust that changes every 10 ms: SciPy's, where 10 ms Euler is far off."""
-    world, rough = OffNominal(HOVER, Condition("", fine=True)), OffNominal(HOVER, NOMINAL)
+    world, rough = OffNominal(HOVER, Condition("", rk4=True)), OffNominal(HOVER, NOMINAL)
 
     def tumbling(world: OffNominal) -> State:
         start = world.reset(jax.random.PRNGKey(5))
@@ -109,7 +109,7 @@ def test_rk4_flies_the_true_motion() -> None:
 
 def test_an_action_acts_one_step_late() -> None:
     """What was asked for in a step is flown in the next; hover thrust in the first, as the accelerations show."""
-    late, nominal = flown(Condition("", late=True)), OffNominal(HOVER, NOMINAL)
+    late, nominal = flown(Condition("", delayed=True)), OffNominal(HOVER, NOMINAL)
     delayed = np.concatenate([np.zeros((LANES, 1, 4), np.float32), late.actions[:, : STEPS - 1]], axis=1)
 
     @jax.jit
@@ -121,7 +121,7 @@ def test_an_action_acts_one_step_late() -> None:
     np.testing.assert_allclose(late.states.obs[:, 1:], observations, atol=1e-5)
     speed_up = np.linalg.norm(np.diff(late.states.obs[:, :2, 12:15], axis=1)[:, 0] + [0, 0, 0.0981], axis=-1)
     np.testing.assert_allclose(speed_up, 0.0981, rtol=1e-4)  # g·dt along body z
-    np.testing.assert_allclose(late.states.info["sensed"], late.states.obs, atol=1e-5)
+    np.testing.assert_allclose(late.states.info["sensor_obs"], late.states.obs, atol=1e-5)
 
 
 def test_errors_are_gaussian_of_their_sizes() -> None:
@@ -129,11 +129,13 @@ def test_errors_are_gaussian_of_their_sizes() -> None:
     before or the lane beside, at five sigmas of the sample; what is seen of the attitude is a rotation still.
     """
     states = flown(Condition("", noise=NOISE)).states
-    true, seen = rotations(states.obs), rotations(states.info["sensed"])
+    true, seen = rotations(states.obs), rotations(states.info["sensor_obs"])
     np.testing.assert_allclose(seen @ seen.swapaxes(-1, -2), np.broadcast_to(np.eye(3), seen.shape), atol=2e-6)
     assert np.linalg.det(seen).min() > 0.99
     off = Rotation.from_matrix((true.swapaxes(-1, -2) @ seen).reshape(-1, 3, 3)).as_rotvec()  # about the body's axes
-    errors = np.concatenate([(states.info["sensed"] - states.obs)[..., 9:], off.reshape(*seen.shape[:2], 3)], axis=-1)
+    errors = np.concatenate(
+        [(states.info["sensor_obs"] - states.obs)[..., 9:], off.reshape(*seen.shape[:2], 3)], axis=-1
+    )
     scaled = errors.astype(np.float64) / np.repeat([0.01, 0.02, 0.02, 0.01], 3)
     n = LANES * (STEPS + 1)
     assert np.abs(scaled.mean(axis=(0, 1))).max() < 5 / np.sqrt(n)
@@ -148,7 +150,7 @@ def test_errors_are_gaussian_of_their_sizes() -> None:
 def test_each_sensor_has_its_own_error(name: str, part: int) -> None:
     """The others then say what is."""
     states = jax.jit(lambda k: OffNominal(HOVER, one_noise(**{name: 0.5})).reset(k))(jax.random.PRNGKey(0))
-    wrong = np.abs(np.asarray(states.info["sensed"] - states.obs)) > 1e-3
+    wrong = np.abs(np.asarray(states.info["sensor_obs"] - states.obs)) > 1e-3
     assert set(np.flatnonzero(wrong)) == {part, part + 1, part + 2}
 
 
@@ -157,7 +159,7 @@ def test_the_true_state_does_not_hear_of_the_noise() -> None:
     nominal, noisy, silent = (flown(c).states for c in (NOMINAL, Condition("", noise=NOISE), one_noise()))
     np.testing.assert_allclose(noisy.obs, nominal.obs, atol=1e-5)
     np.testing.assert_allclose(noisy.reward, nominal.reward, atol=1e-5)
-    np.testing.assert_allclose(silent.info["sensed"], nominal.obs, atol=1e-5)
+    np.testing.assert_allclose(silent.info["sensor_obs"], nominal.obs, atol=1e-5)
 
 
 @functools.cache
@@ -195,7 +197,7 @@ def test_noise_is_its_keys_own() -> None:
 
 def test_the_papers_trial_starts_anyhow_but_there() -> None:
     """Its position and velocity; attitudes uniform over SO(3), body rates in the start's ±1 rad/s."""
-    trial = OffNominal(HOVER, Condition("", trial=True)).evaluation().env
+    trial = OffNominal(HOVER, Condition("", paper_trial=True)).evaluation().env
     start = np.asarray(jax.jit(jax.vmap(trial.reset))(keys(2000)).obs)
     np.testing.assert_allclose(start[:, 9:15] - [-1.58, 0.99, 1.45, -2.39, 6.20, 0.77], 0.0, atol=1e-6)
     assert np.abs(start[:, :9].mean(axis=0)).max() < 5 / np.sqrt(3 * 2000)  # each entry: mean 0, variance 1/3
@@ -209,11 +211,11 @@ def test_the_conditions_are_those_that_a_policy_is_judged_by() -> None:
     named = perturbations.conditions(HOVER)
     differs = {name: {f for f in Condition._fields[1:] if getattr(c, f)} for name, c in named.items()}
     assert differs == {
-        "rk4": {"fine"},
-        "latency": {"late"},
+        "rk4": {"rk4"},
+        "latency": {"delayed"},
         "noise": {"noise"},
-        "together": {"fine", "late", "noise"},
-        "trial": {"trial"},
+        "together": {"rk4", "delayed", "noise"},
+        "trial": {"paper_trial"},
     }
     assert {c.noise for c in named.values() if c.noise} == {Noise(0.01, 0.02, 0.01, 0.02)}
     assert named.keys() - perturbations.conditions(quadrotor_task("circle")).keys() == {"trial"}

@@ -80,7 +80,7 @@ def fly_euler(physics: Physics, body: Body, thrust: Array, dt_s: float, steps: i
 @jax.jit
 def fly_rk4(physics: Physics, body: Body, thrust: Array, dt_s: float, steps: int) -> Body:
     """The same time in as many parts by Runge–Kutta."""
-    return quadrotor.step_finely(physics, body, thrust, steps * dt_s, steps)
+    return quadrotor.step_rk4(physics, body, thrust, steps * dt_s, steps)
 
 
 Integrator = Callable[[Physics, Body, Array, float, int], Body]

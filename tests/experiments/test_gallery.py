@@ -173,7 +173,7 @@ def test_the_viewer_is_screenshoted(tmp_path: Path) -> None:
     observations, actions = np.zeros((1, 101, 18)), np.zeros((1, 100, 4))
     observations[..., [0, 4, 8]] = 1.0
     observations[..., 9] = np.cos(t)
-    flown = viewer.Flown([0], observations, actions)
+    flown = viewer.Recording([0], observations, actions)
     (tmp_path / "view.html").write_text(viewer.page(task.load("hover"), "made up", flown))
     gallery.screenshot(tmp_path / "view.html", "#start=0&t=0.5", tmp_path / "view.png")
     pixels = (255 * image.imread(tmp_path / "view.png")[..., :3]).astype(int)

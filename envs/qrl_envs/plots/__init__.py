@@ -1,6 +1,6 @@
-"""Pictures of flights as PNG: a few of them in full (`flights.draw`), the errors of all of them (`errors.draw`), and
-how soon they settle by how they began (`settle.draw`).
+"""Plots of flights as PNG: the first flights (`flights.draw`), the errors of all flights over time (`errors.draw`), and
+settle times over the start's tilt and speed (`settle.draw`).
 
-What is measured is what measures.py measures, and every tolerance drawn is the task's. A figure is made apart
-from being saved, of matplotlib's objects alone: no pyplot, so no state is left behind.
+Errors are those of `measures`, tolerances those of the task. `figure` returns what `draw` saves; both use matplotlib's
+objects without pyplot, so no global state is left.
 """

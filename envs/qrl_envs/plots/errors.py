@@ -16,28 +16,28 @@ from qrl_envs.plots.measured import ERRORS, successes
 from qrl_envs.plots.overtime import Panel, logarithmic, over_time
 from qrl_envs.task import Task
 
-LINES: tuple[dict[str, Any], ...] = (  # told apart without colour too
+LINES: tuple[dict[str, Any], ...] = (  # distinguishable without color
     {"color": COLOURS[1], "linestyle": "-"},
     {"color": COLOURS[2], "linestyle": (0, (5, 1.5))},
     {"color": COLOURS[3], "linestyle": (0, (1, 1))},
     {"color": "black", "linestyle": (0, (5, 1.5, 1, 1.5))},
 )
-SHORT = 24  # letters of a name in the legend
-Others = Mapping[str, np.ndarray]  # by name, observations [n, K + 1, F] of others from the same starts
+SHORT = 24  # characters of a name in the legend
+Others = Mapping[str, np.ndarray]  # name -> observations [n, K + 1, F] of another policy from the same starts
 
 
 def draw(path: Path, task: Task, observations: np.ndarray, others: Others = MappingProxyType({})) -> None:
-    """Draw the errors and settle times of all of `observations` [n, K + 1, F], SI units, at times 0, dt, … K·dt.
+    """Save the errors and the settled share over time of flights with `observations` [n, K + 1, F], in SI units.
 
-    Of the first few of `others` the median errors and the share settled are drawn beside them.
+    For comparison it shows the median errors and settled share of the first few of `others`.
     """
     figure(task, observations, others).savefig(path, format="png")
 
 
 def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyType({})) -> Figure:
-    """What `draw` saves. Axes: the spread of each error over time, and last the share that has settled."""
+    """The figure of `draw`. Axes: the spread of each error over time, and last the share that has settled."""
     found = measures.of_flights(task, observations)
-    beside = {name: measures.of_flights(task, flown) for name, flown in list(others.items())[: len(LINES)]}
+    compared = {name: measures.of_flights(task, other) for name, other in list(others.items())[: len(LINES)]}
     names = [name for name in ERRORS if name in found.errors]
     rows = len(names) // 2 + 1
     figure = empty(task, height_in=2.0 + 2.0 * rows)
@@ -49,10 +49,10 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
         low, median, high = panel.values
         axes.fill_between(times, low, high, color=COLOURS[0], alpha=0.3, linewidth=0, label="5 % to 95 % of flights")
         axes.plot(times, median, color=COLOURS[0], linewidth=2, label="median flight")
-        for (other, there), looks in zip(beside.items(), LINES, strict=False):
+        for (other, there), looks in zip(compared.items(), LINES, strict=False):
             line = np.clip(_ranks(there.errors[name])[1], *panel.limits)
             axes.plot(times, line, linewidth=1.1, label=f"median of {_short(other)}", **looks)
-    _settled(grid[len(names)], task, found, beside, observations.shape[1])
+    _settled(grid[len(names)], task, found, compared, observations.shape[1])
     for axes, title in zip(grid, (f"all {len(observations):,} flights", successes(found)), strict=False):
         finish(axes, title)
     for axes in grid[2:]:
@@ -62,7 +62,7 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
 
 
 def _short(name: str) -> str:
-    """A folder's long name by its last parts, which tell it from others."""
+    """A path shortened to its last parts, which identify it."""
     parts = name.split("/")
     while len(parts) > 1 and len("/".join(parts)) > SHORT:
         parts = parts[1:]
@@ -70,15 +70,12 @@ def _short(name: str) -> str:
 
 
 def _ranks(errors: np.ndarray) -> np.ndarray:
-    """Of |errors| [n, K + 1] at each time the one 5 %, 50 % and 95 % up the ranks: [3, K + 1].
-
-    A number that is not finite ranks last, as infinite: to measures.py it is a failure too.
-    """
+    """The 5 %, 50 % and 95 % quantiles of |errors| [n, K + 1] over time: [3, K + 1]. Non-finite numbers count as ∞."""
     ranked = np.sort(np.where(np.isfinite(errors), np.abs(errors), np.inf), axis=0)
     return ranked[[round(share * (len(errors) - 1)) for share in (0.05, 0.5, 0.95)]]
 
 
-def _settled(axes: Axes, task: Task, found: Measured, beside: dict[str, Measured], samples: int) -> None:
+def _settled(axes: Axes, task: Task, found: Measured, compared: dict[str, Measured], samples: int) -> None:
     """The share of flights that have settled, over time."""
     times = np.arange(samples) * task.control_period_s
 
@@ -87,5 +84,5 @@ def _settled(axes: Axes, task: Task, found: Measured, beside: dict[str, Measured
 
     over_time(axes, task, Panel("flights settled", "%", share(found.settle_s)[None], (0.0, 103.0)))
     axes.plot(times, share(found.settle_s), color=COLOURS[0], linewidth=2)
-    for (other, there), looks in zip(beside.items(), LINES, strict=False):
+    for (other, there), looks in zip(compared.items(), LINES, strict=False):
         axes.plot(times, share(there.settle_s), linewidth=1.1, label=f"median of {_short(other)}", **looks)

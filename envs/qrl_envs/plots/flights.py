@@ -1,4 +1,4 @@
-"""A few flights in full: where they went, and two quantities over time."""
+"""The first flights: their paths, and two quantities over time."""
 
 from pathlib import Path
 
@@ -12,16 +12,16 @@ from qrl_envs.plots.measured import successes
 from qrl_envs.plots.overtime import Panel, logarithmic, over_time
 from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
 
-SHOWN = 5  # flights drawn in full
+SHOWN = 5  # flights
 
 
 def draw(path: Path, task: Task, observations: np.ndarray) -> None:
-    """Draw the first few flights of `observations` [n, K + 1, F], SI units, at times 0, dt, … K·dt."""
+    """Save a plot of the first flights of `observations` [n, K + 1, F], in SI units."""
     figure(task, observations).savefig(path, format="png")
 
 
 def figure(task: Task, observations: np.ndarray) -> Figure:
-    """What `draw` saves. Axes: where the first few went, and two quantities over time."""
+    """The figure of `draw`. Axes: paths, and two quantities over time."""
     found = measures.of_flights(task, observations)
     shown = np.where(np.isfinite(observations), observations, np.nan)[:SHOWN]
     figure = empty(task, height_in=5.0)
@@ -44,12 +44,12 @@ def figure(task: Task, observations: np.ndarray) -> Figure:
     return figure
 
 
-# Where flights went
+# Paths
 
 
 def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None:
-    """Paths of `shown` [few, K + 1, 18] over the ground; the triangle at a start points as the vehicle's top does."""
-    wanted, reach = task.evaluation.reward, 0.0
+    """Paths of `shown` [few, K + 1, 18] from above; the triangle at a start points up or down like body z."""
+    reward, reach = task.evaluation.reward, 0.0
     for colour, path in zip(COLOURS, shown[:, :, 9:11], strict=False):
         axes.plot(*path.T, color=colour, linewidth=1.4)
     starts, up = shown[:, 0, 9:11], shown[:, 0, 8]  # r33: the body's z axis along the world's
@@ -58,34 +58,34 @@ def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None
         axes.scatter(*starts[among].T, c=colours, marker=marker, s=90, edgecolors="white", zorder=4)
         if among.any():
             axes.plot([], [], marker, color=INK, markersize=8, label=label)
-    if isinstance(wanted, CircleReward):
-        _circle(axes, wanted)
-        reach = wanted.radius_m
+    if isinstance(reward, CircleReward):
+        _circle(axes, reward)
+        reach = reward.radius_m
     else:
-        axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="wanted position")
+        axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="target")
     half = _half_width(shown[:, :, 9:11], reach, task.evaluation.start.position_m)
     axes.set(xlabel="x [m], seen from above", ylabel="y [m]", aspect="equal", xlim=(-half, half), ylim=(-half, half))
 
 
-def _circle(axes: Axes, wanted: CircleReward) -> None:
-    """The circle to fly, dashed, and which way round."""
+def _circle(axes: Axes, target: CircleReward) -> None:
+    """The target circle, dashed, with its direction."""
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    x, y = wanted.radius_m * np.cos(angle), wanted.radius_m * np.sin(angle)
-    axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="wanted path")
+    x, y = target.radius_m * np.cos(angle), target.radius_m * np.sin(angle)
+    axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="target")
     arrow = {"arrowstyle": "-|>", "color": "black", "mutation_scale": 22, "shrinkA": 0, "shrinkB": 0}
     for k in (22, 112):
         axes.annotate("", xy=(x[k + 3], y[k + 3]), xytext=(x[k], y[k]), arrowprops=arrow, zorder=6)
-    axes.text(0, 0, f"{wanted.speed_m_s:g} m/s", ha="center", va="center", color=INK, fontsize=11)
+    axes.text(0, 0, f"{target.speed_m_s:g} m/s", ha="center", va="center", color=INK, fontsize=11)
 
 
 def _half_width(paths: np.ndarray, reach_m: float, start_m: float) -> float:
-    """Of a window on `paths` [n, K + 1, 2] that shows the target and the starts; what flees farther leaves it."""
+    """Half the width of a window on `paths` [n, K + 1, 2] that shows target and starts; distant parts are cut off."""
     extent = np.max(np.abs(paths), initial=0.0, where=np.isfinite(paths))
     return 1.12 * max(min(extent, 2.0 * (start_m + reach_m)), reach_m, 0.1)
 
 
 def _phase_portrait(axes: Axes, task: PendulumTask, shown: np.ndarray) -> None:
-    """Rate over angle of `shown` [few, K + 1, 3]."""
+    """Rate over angle for `shown` [few, K + 1, 3]."""
     for colour, theta, rate in zip(COLOURS, _angle(shown), shown[:, :, 2], strict=False):
         for line in _turns(theta):
             axes.plot(line, rate, color=colour, linewidth=1.4)
@@ -98,31 +98,31 @@ def _phase_portrait(axes: Axes, task: PendulumTask, shown: np.ndarray) -> None:
 
 
 def _angle(shown: np.ndarray) -> np.ndarray:
-    """From upright, in ±π, of `shown` [n, K + 1, 3]: [n, K + 1]."""
+    """Angle from upright in ±π, for `shown` [n, K + 1, 3]: [n, K + 1]."""
     return np.arctan2(shown[:, :, 1], shown[:, :, 0])
 
 
 def _turns(angle: np.ndarray) -> list[np.ndarray]:
-    """Lines for an axis of ±π: the unwrapped `angle` [K + 1] shifted by each whole turn that brings a part into view.
+    """Lines for an axis of ±π: the unwrapped `angle` [K + 1], shifted by each multiple of 2π that makes a part visible.
 
-    So no line jumps across the axis, and none stops short of its edge.
+    So no line jumps across the axis or stops before its edge.
     """
-    whole = np.unwrap(angle)
-    turns = np.round(whole[np.isfinite(whole)] / (2.0 * np.pi))
-    return [whole - 2.0 * np.pi * turn for turn in np.unique(turns)]
+    unwrapped = np.unwrap(angle)
+    turns = np.round(unwrapped[np.isfinite(unwrapped)] / (2.0 * np.pi))
+    return [unwrapped - 2.0 * np.pi * turn for turn in np.unique(turns)]
 
 
 # Quantities over time
 
 
 def _quadrotor_panels(task: QuadrotorTask, shown: np.ndarray, errors: dict[str, np.ndarray]) -> tuple[Panel, Panel]:
-    spec, wanted = task.evaluation, task.evaluation.reward
+    spec, reward = task.evaluation, task.evaluation.reward
     few = {name: np.where(np.isfinite(error), error, np.nan)[: len(shown)] for name, error in errors.items()}
-    if isinstance(wanted, CircleReward) and spec.speed_m_s is not None:
-        distance, speed = np.hypot(few["radius_m"], few["height_m"]), few["speed_m_s"] + wanted.speed_m_s
+    if isinstance(reward, CircleReward) and spec.speed_m_s is not None:
+        distance, speed = np.hypot(few["radius_m"], few["height_m"]), few["speed_m_s"] + reward.speed_m_s
         return (
             logarithmic("distance to circle", "m", distance, spec.distance_m),
-            Panel("tangential speed", "m/s", speed, _limits(speed, wanted.speed_m_s), wanted.speed_m_s, spec.speed_m_s),
+            Panel("tangential speed", "m/s", speed, _limits(speed, reward.speed_m_s), reward.speed_m_s, spec.speed_m_s),
         )
     tilt = np.degrees(np.arccos(np.clip(shown[:, :, 8], -1.0, 1.0)))
     return (
@@ -139,9 +139,9 @@ def _pendulum_panels(task: PendulumTask, shown: np.ndarray) -> tuple[Panel, Pane
     )
 
 
-def _limits(speed: np.ndarray, wanted: float) -> tuple[float, float]:
-    """Of an axis that shows `speed` as far as it lies between −1 and 3 times the one that is wanted."""
-    seen = np.isfinite(speed)
-    low = np.min(speed, initial=0.5 * wanted, where=seen)
-    high = np.max(speed, initial=1.5 * wanted, where=seen)
-    return max(low - 0.1 * wanted, -wanted), min(high + 0.1 * wanted, 3.0 * wanted)
+def _limits(speed: np.ndarray, target: float) -> tuple[float, float]:
+    """Axis limits that show `speed` between −1 and 3 times the target."""
+    finite = np.isfinite(speed)
+    low = np.min(speed, initial=0.5 * target, where=finite)
+    high = np.max(speed, initial=1.5 * target, where=finite)
+    return max(low - 0.1 * target, -target), min(high + 0.1 * target, 3.0 * target)

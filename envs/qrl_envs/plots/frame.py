@@ -1,4 +1,4 @@
-"""The frame of every picture: an empty figure, its axes' looks and its legend, in colours for any eye."""
+"""Shared parts of the plots: an empty figure, axes style, legend, and colors for color-blind readers."""
 
 import textwrap
 
@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from qrl_envs.task import Task
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")  # of Okabe and Ito's, for any eye
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")  # Okabe and Ito: safe for color-blind readers
 INK, SHADE, GOOD = "#333333", "#EEEEEE", "#009E73"
 PIXELS_PER_INCH = 150
 
@@ -20,8 +20,8 @@ def empty(task: Task, height_in: float) -> Figure:
     """An empty figure, titled with the task."""
     figure = Figure(figsize=(10.0, height_in), dpi=PIXELS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
-    what = textwrap.shorten(f"{task.reward.form}: {task.description}", 90, placeholder=" …")
-    figure.suptitle(what, fontsize=13, fontweight="bold", color=INK, parse_math=False)
+    title = textwrap.shorten(f"{task.reward.form}: {task.description}", 90, placeholder=" …")
+    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK, parse_math=False)
     return figure
 
 

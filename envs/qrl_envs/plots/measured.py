@@ -1,4 +1,4 @@
-"""What measures.py says of many flights, as pictures name it."""
+"""Labels of the errors of `measures`."""
 
 import numpy as np
 
@@ -14,4 +14,5 @@ ERRORS = {  # name in measures.py -> label; unit; name of its tolerance in the t
 
 
 def successes(found: Measured) -> str:
+    """The number of flights that succeed, in words."""
     return f"{np.sum(found.success):,} of {len(found.success):,} flights succeed"

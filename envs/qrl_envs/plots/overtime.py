@@ -1,4 +1,4 @@
-"""A quantity over time: its axis, its tolerance and the time that is judged."""
+"""One quantity over time: its axis, its tolerance and the tail that success is evaluated on."""
 
 from typing import Literal, NamedTuple
 
@@ -9,33 +9,33 @@ from matplotlib.ticker import FuncFormatter, MultipleLocator, NullFormatter
 from qrl_envs.plots.frame import GOOD, INK, SHADE, in_pi
 from qrl_envs.task import Task
 
-LEAST, MOST = 0.01, 200.0  # what a logarithmic axis shows at most, in tolerances
+MIN, MAX = 0.01, 200.0  # limits of a logarithmic axis, in tolerances
 
 
 class Panel(NamedTuple):
-    """One quantity over time, and what is asked of it."""
+    """One quantity over time, and its target."""
 
     label: str
     unit: str
     values: np.ndarray  # [lines, K + 1]
     limits: tuple[float, float]
-    wanted: float = 0.0
-    tolerance: float | None = None  # ± about `wanted`; on a logarithmic axis an upper bound
+    target: float = 0.0
+    tolerance: float | None = None  # ± about `target`; on a logarithmic axis an upper bound
     scale: Literal["linear", "log", "angle"] = "linear"
 
 
 def logarithmic(label: str, unit: str, values: np.ndarray, tolerance: float) -> Panel:
-    """A panel of sizes ≥ 0, drawn along the axis' edge where they lie beyond it; a NaN is not drawn."""
+    """A panel of values ≥ 0, clipped to the axis; NaN is not drawn."""
     largest = np.max(values, initial=0.0, where=np.isfinite(values))
-    limits = LEAST * tolerance, 1.2 * tolerance * min(max(largest / tolerance, 10.0), MOST)
+    limits = MIN * tolerance, 1.2 * tolerance * min(max(largest / tolerance, 10.0), MAX)
     return Panel(label, unit, np.clip(values, *limits), limits, 0.0, tolerance, "log")
 
 
 def over_time(axes: Axes, task: Task, panel: Panel) -> np.ndarray:
-    """Make `axes` ready for the panel's lines; the times [s] of its samples, [K + 1]."""
+    """Prepare `axes` for the panel's lines and return the times [s] of its samples [K + 1]."""
     times = np.arange(panel.values.shape[1]) * task.control_period_s
     tail_s, end_s = task.evaluation.tail_s, max(times[-1], task.control_period_s)
-    axes.axvspan(max(end_s - tail_s, 0.0), end_s, color=SHADE, zorder=0, label=f"judged: the last {tail_s:g} s")
+    axes.axvspan(max(end_s - tail_s, 0.0), end_s, color=SHADE, zorder=0, label=f"evaluated: the last {tail_s:g} s")
     axes.set_yscale("log" if panel.scale == "log" else "linear")
     if panel.scale == "log":
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -55,8 +55,8 @@ def over_time(axes: Axes, task: Task, panel: Panel) -> np.ndarray:
 
 
 def _tolerance(axes: Axes, panel: Panel, tolerance: float) -> None:
-    """The band to be in, its edges dashed and its size written beside it."""
-    low, high = panel.wanted - tolerance, panel.wanted + tolerance
+    """The tolerance band, with dashed edges and its size as a label."""
+    low, high = panel.target - tolerance, panel.target + tolerance
     if panel.scale == "log":
         low = panel.limits[0]
     axes.axhspan(low, high, color=GOOD, alpha=0.13, zorder=0.5, linewidth=0)

@@ -1,4 +1,4 @@
-"""How long flights take to settle, by how they began: a map over the start's tilt and speed."""
+"""Settle times as a map over the start's tilt and speed."""
 
 from pathlib import Path
 
@@ -16,18 +16,18 @@ from qrl_envs.task import QuadrotorTask
 
 TILT_EDGES_DEG = np.linspace(0.0, 180.0, 13)
 SPEEDS = 8  # cells
-LEAST = 3  # flights that a cell's median is of
+MIN_FLIGHTS = 3  # in a cell, for its median
 FAILED = "#D55E00"
-MANY = 50  # crosses that may be large
+MANY = 50  # failures; more are drawn with smaller crosses
 
 
 def draw(path: Path, task: QuadrotorTask, observations: np.ndarray) -> None:
-    """Draw when all of `observations` [n, K + 1, 18], SI units, at times 0, dt, … K·dt, settle."""
+    """Save a map of the settle times of flights with `observations` [n, K + 1, 18], in SI units."""
     figure(task, observations).savefig(path, format="png")
 
 
 def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
-    """What `draw` saves. Axes: the map, and its colour bar."""
+    """The figure of `draw`. Axes: the map, and its color bar."""
     found = measures.of_flights(task, observations)
     tilt, speed = tilt_deg(observations[:, 0]), speed_m_s(observations[:, 0])
     figure = empty(task, height_in=5.6)
@@ -45,15 +45,15 @@ def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
             color=FAILED,
             markersize=9 if failed.sum() <= MANY else 5,
             markeredgewidth=2.2 if failed.sum() <= MANY else 1.2,
-            label="a start that fails",
+            label="failed start",
             clip_on=False,
         )
-    axes.fill_between([], [], color=SHADE, label=f"fewer than {LEAST} flights")
+    axes.fill_between([], [], color=SHADE, label=f"fewer than {MIN_FLIGHTS} flights")
     axes.set(
         xlabel="tilt at the start [°]", ylabel="speed at the start [m/s]", xlim=(0.0, 180.0), ylim=(0.0, edges[-1])
     )
     axes.xaxis.set_major_locator(MultipleLocator(30.0))
-    finish(axes, f"time to settle by how a flight began; {successes(found)}")
+    finish(axes, f"time to settle over the start; {successes(found)}")
     axes.grid(visible=False)
     axes.set_facecolor(SHADE)
     legend(figure)
@@ -61,22 +61,22 @@ def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
 
 
 def medians(tilt: np.ndarray, speed: np.ndarray, settle_s: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Of each cell [speeds, tilts] the median settle time [s], for tilt [°], speed [m/s] and settle_s [n] of n flights.
+    """The median settle time [s] of each cell [speeds, tilts], for tilt [°], speed [m/s] and settle_s [n] of n flights.
 
-    NaN where there are fewer than LEAST; infinite where half of them or more never settle.
+    NaN for fewer than MIN_FLIGHTS flights; infinite if half of them or more never settle.
     """
     column, row = np.digitize(tilt, TILT_EDGES_DEG) - 1, np.digitize(speed, edges) - 1
-    column = np.minimum(column, len(TILT_EDGES_DEG) - 2)  # right upside down
+    column = np.minimum(column, len(TILT_EDGES_DEG) - 2)  # exactly upside down
     cells = np.full((len(edges) - 1, len(TILT_EDGES_DEG) - 1), np.nan)
     for i, j in np.ndindex(cells.shape):
         here = settle_s[(row == i) & (column == j)]
-        if len(here) >= LEAST:
+        if len(here) >= MIN_FLIGHTS:
             cells[i, j] = np.sort(here)[len(here) // 2]
     return cells
 
 
 def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> None:
-    """The cells in colours, each with its number."""
+    """Draw the cells in color, each with its number."""
     settled = cells[np.isfinite(cells)]
     low, high = (settled.min(), settled.max()) if len(settled) else (0.0, 1.0)
     high = max(high, low + 0.1)

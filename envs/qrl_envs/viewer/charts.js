@@ -45,7 +45,7 @@ function makeCharts(parent, page, jump) {
     const values = panel.lines.map(line => {
       const item = element("span", head);
       element("i", item).style.background = line.colour;
-      item.title = line.says;
+      item.title = line.description;
       return { name: line.name, text: item.appendChild(new Text()) };
     });
     const plot = element("div", section, "plot"), drawing = element("div", plot, "drawing"), cursor = element("div", plot, "cursor");

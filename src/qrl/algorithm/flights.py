@@ -31,8 +31,8 @@ def fly(
     """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
 
     An environment with an `evaluation` is flown and measured as that says, another for one episode of
-    `max_episode_steps`. `reset` draws the starts. Where sensors err, the policy sees `info["sensed"]`; measured is the
-    true observation. A flight that ends early has no more observations: its NaNs make it a failure.
+    `max_episode_steps`. `reset` draws the starts. The policy sees `info["sensor_obs"]`, if present; the
+    measures see the true observation. A flight that ends early has no more observations: its NaNs make it a failure.
     """
     plan = adapt(env).evaluation()
     measure = plan.measure if plan else None
@@ -40,7 +40,7 @@ def fly(
 
     def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
         state, total = carry
-        action = jnp.clip(mean(state.info.get("sensed", state.obs)), -1.0, 1.0)
+        action = jnp.clip(mean(state.info.get("sensor_obs", state.obs)), -1.0, 1.0)
         after = jax.vmap(env.step)(state, action)
         over = state.done.astype(bool)
         total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)

@@ -178,7 +178,7 @@ def _print(table: list[dict[str, Any]], flown: Flown, named: dict[str, Condition
     if named:
         console.print("\noff nominal:")
         for name, condition in named.items():
-            console.print(f"  {name}: {condition.says}")
+            console.print(f"  {name}: {condition.description}")
         for name, result in pilots.items():
             said = f"seed {result['seed']}, step {result['env_steps']:,}" if "seed" in result else ""
             tables.off_nominal(", ".join(filter(None, (name if name not in policies else "policy", said))), result)

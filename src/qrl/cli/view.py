@@ -18,7 +18,7 @@ from qrl.training.state import member_inputs, stack
 from qrl.training.trainer import Trainer, make_trainer
 from qrl_envs import viewer
 from qrl_envs.specfile import BadInput
-from qrl_envs.viewer import Flown
+from qrl_envs.viewer import Recording
 
 SHOWN = 8  # unless asked for others
 FAILURES = 6  # of them, at most, that are known to fail
@@ -41,7 +41,8 @@ def view(args: argparse.Namespace) -> int:
         member, starts = config.member(i), asked or _varied(folder)
         env_steps, flights = _flown(trainer, member, folder, starts)
         title = f"{member.task.name}, seed {member.seed}, step {env_steps:,}"
-        page = viewer.page(task, title, Flown(starts, np.asarray(flights.observations), np.asarray(flights.actions)))
+        recording = Recording(starts, np.asarray(flights.observations), np.asarray(flights.actions))
+        page = viewer.page(task, title, recording)
         path = args.out or folder / "view.html"
         files.replace_text(path, page)
         console.print(f"{path}: {len(starts)} flights, {len(page.encode()) / 1e6:.1f} MB; open it in a browser")
