@@ -17,7 +17,7 @@ from test_quadrotor import flat, newton_euler
 from qrl.algorithm import flights as evaluate
 from qrl.algorithm.flights import Flights
 from qrl_envs import env, perturbations, task
-from qrl_envs.perturbations import Condition, Noise, OffNominal
+from qrl_envs.perturbations import Condition, Noise, OffNominal, PerturbedParams
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
@@ -47,16 +47,20 @@ class Flown(NamedTuple):
 @functools.cache
 def flown(condition: Condition) -> Flown:
     """LANES starts of a hover under random actions, the same ones whatever the condition."""
-    world = OffNominal(HOVER, condition)
     actions = jax.random.uniform(jax.random.PRNGKey(1), (LANES, STEPS + 1, 4), minval=-1.0, maxval=1.0)
-
-    def fly(key: jax.Array, actions: jax.Array) -> State:
-        start = world.reset(key)
-        _, after = jax.lax.scan(lambda state, a: (now := world.step(state, a), now), start, actions)
-        return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, after)
-
     keys = jax.random.split(jax.random.PRNGKey(0), LANES)
-    return Flown(jax.tree.map(np.asarray, jax.jit(jax.vmap(fly))(keys, actions[:, :-1])), np.asarray(actions))
+    states = states_of(OffNominal(HOVER, condition).params, keys, actions[:, :-1])
+    return Flown(jax.tree.map(np.asarray, states), np.asarray(actions))
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, 0, 0))
+def states_of(params: PerturbedParams, key: jax.Array, actions: jax.Array) -> State:
+    """One program for all conditions."""
+    world = OffNominal(HOVER, NOMINAL).with_params(params)
+    start = world.reset(key)
+    _, after = jax.lax.scan(lambda state, a: (now := world.step(state, a), now), start, actions)
+    return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs]), start, after)
 
 
 def one_noise(**sizes: float) -> Condition:

@@ -140,7 +140,7 @@ def test_tolerances_are_the_tasks(name: str) -> None:
     assert tolerances(figure) == in_flights
     assert tolerances(errors_of.figure(other, approach(name))) == in_errors
     for line in figure.axes[0].lines:
-        if line.get_label() == "target":
+        if line.get_label() == "target circle":
             np.testing.assert_allclose(np.linalg.norm(line.get_xydata(), axis=1), 1.25)
 
 

@@ -1,4 +1,4 @@
-"""Symmetries of the tasks: the turned world goes the turned way, for the same reward."""
+"""Symmetries of the tasks: a transformed step is the step transformed, with the same reward."""
 
 from typing import Any
 
@@ -15,6 +15,7 @@ from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from qrl_envs import task as tasks
 from qrl_envs.env import TaskEnv
+from qrl_envs.symmetry import Symmetry
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 DRAWS = 64
@@ -32,29 +33,22 @@ def changed(name: str, vehicle: dict[str, Any]) -> TaskEnv:
     return worlds.from_task(tasks.from_data(spec, name))
 
 
-def body_at(observation: np.ndarray) -> quadrotor.Body:
-    """The body that is so observed; scipy's quaternion."""
-    attitude = Rotation.from_matrix(observation[:9].reshape(3, 3)).as_quat(scalar_first=True)
-    parts = (
-        jnp.asarray(part, jnp.float32) for part in (observation[9:12], attitude, observation[12:15], observation[15:])
-    )
-    position, attitude, velocity, rate = parts
-    return quadrotor.Body(quadrotor.Pose(position, attitude), quadrotor.Twist(velocity, rate))
+def bodies_at(observations: np.ndarray) -> quadrotor.Body:
+    """The bodies with these observations [n, 18], by SciPy's quaternions."""
+    attitude = Rotation.from_matrix(observations[:, :9].reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    position, velocity, rate = (observations[:, i : i + 3] for i in (9, 12, 15))
+    body = quadrotor.Body(quadrotor.Pose(position, attitude), quadrotor.Twist(velocity, rate))
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), body)
 
 
-def flown(env: TaskEnv, observation: np.ndarray, action: np.ndarray) -> tuple[np.ndarray, float]:
-    """Observation and reward one step after `observation`."""
-    body = body_at(observation)
-    body, reward = env._advance(env.params, body, jnp.asarray(action, jnp.float32))
-    return np.asarray(env._observe(body)), float(reward)
-
-
-def different(found: list[np.ndarray]) -> int:
-    return len({tuple(np.round(matrix, 3).ravel() + 0.0) for matrix in found})
+def draws(env: TaskEnv, n: int, seed: int = 0) -> Symmetry:
+    """n symmetries of the task, in NumPy."""
+    u = jnp.asarray(np.random.default_rng(seed).random((n, 2)), jnp.float32)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(env.symmetry))(u))
 
 
 @pytest.mark.parametrize(
-    ("name", "vehicle", "turns"),
+    ("name", "vehicle", "permutations"),
     [
         ("hover", {}, 4),
         ("circle", {}, 2),
@@ -62,54 +56,57 @@ def different(found: list[np.ndarray]) -> int:
         ("hover", PLUS | {"inertia_kg_m2": [0.0023, 0.0023, 0.0037]}, 4),
     ],
 )
-def test_the_turned_vehicle_flies_the_turned_way(name: str, vehicle: dict[str, Any], turns: int) -> None:
-    """step(G·s, P·a) = G·step(s, a) and the same reward; as many ways to turn the motors as the vehicle has.
+def test_a_transformed_step_is_the_step_transformed(name: str, vehicle: dict[str, Any], permutations: int) -> None:
+    """step(G·s, P·a) = G·step(s, a) and the same reward; as many motor permutations as the vehicle has.
 
-    A quarter turn would swap motors that spin oppositely; a plus is mirrored about its diagonals.
+    A quarter turn would swap motors of opposite spin; a plus frame is mirrored about its diagonals.
     """
     env, rng = changed(name, vehicle), np.random.default_rng(0)
-    found = []
-    for u in rng.random((DRAWS, 2)):
-        turn = jax.tree.map(np.asarray, env.symmetry(jnp.asarray(u, jnp.float32)))
-        found.append(turn.action)
-        observation = np.concatenate([Rotation.random(rng=rng).as_matrix().ravel(), rng.normal(size=9) * 2.0])
-        action = rng.uniform(-1.2, 1.2, 4)
-        there, reward = flown(env, observation, action)
-        turned, same = flown(env, turn.observation @ observation, turn.action @ action)
-        np.testing.assert_allclose(turned, turn.observation @ there, atol=2e-5)
-        np.testing.assert_allclose(same, reward, rtol=1e-5)
-        np.testing.assert_allclose(turn.observation @ turn.observation.T, np.eye(18), atol=1e-6)
-    assert different(found) == turns
+    found = draws(env, DRAWS)
+    G, P = found.observation, found.action
+    attitude = Rotation.random(DRAWS, rng=rng).as_matrix().reshape(DRAWS, 9)
+    observation = np.concatenate([attitude, rng.normal(size=(DRAWS, 9)) * 2.0], axis=1)
+    action = rng.uniform(-1.2, 1.2, (DRAWS, 4))
+
+    @jax.jit
+    @jax.vmap
+    def step(body: quadrotor.Body, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        body, reward = env._advance(env.params, body, action)
+        return env._observe(body), reward
+
+    after, reward = step(bodies_at(observation), action.astype(np.float32))
+    transformed = np.einsum("nij,nj->ni", G, observation), np.einsum("nij,nj->ni", P, action).astype(np.float32)
+    transformed_after, same_reward = step(bodies_at(transformed[0]), transformed[1])
+    np.testing.assert_allclose(transformed_after, np.einsum("nij,nj->ni", G, after), atol=2e-5)
+    np.testing.assert_allclose(same_reward, reward, rtol=1e-5)
+    np.testing.assert_allclose(G @ G.swapaxes(1, 2), np.broadcast_to(np.eye(18), G.shape), atol=1e-6)
+    assert len(np.unique(np.round(P, 3) + 0.0, axis=0)) == permutations
 
 
 @pytest.mark.parametrize(
     "broken", [{"max_N": 7.0}, {"position_m": [0.08, 0.07425]}, {"spin": -1}], ids=["weak", "off its place", "reversed"]
 )
 def test_a_lopsided_vehicle_has_no_symmetry_that_moves_its_odd_motor(broken: dict[str, Any]) -> None:
-    """One motor differs: what is left is the mirror through it, if any."""
+    """One motor differs: only the reflection through it could remain."""
     motors = [motor.model_dump(mode="json") for motor in tasks.load("hover").vehicle.motors]  # pyright: ignore[reportAttributeAccessIssue]
     env = changed("hover", {"motors": [motors[0] | broken, *motors[1:]]})
-    for u in np.random.default_rng(0).random((DRAWS, 2)):
-        turn = env.symmetry(jnp.asarray(u, jnp.float32))
-        np.testing.assert_array_equal(turn.action, np.eye(4))
-        np.testing.assert_array_equal(turn.observation, np.eye(18))
+    found = draws(env, DRAWS)
+    np.testing.assert_array_equal(found.action, np.broadcast_to(np.eye(4), found.action.shape))
+    np.testing.assert_array_equal(found.observation, np.broadcast_to(np.eye(18), found.observation.shape))
 
 
 def test_two_motors_in_one_place_leave_the_task_as_it_is() -> None:
-    """Which of them moves where cannot be said: no turn, and no action counted twice."""
+    """The permutation is not unique: only the identity is drawn, and no action counts twice."""
     motors = [motor.model_dump(mode="json") for motor in tasks.load("hover").vehicle.motors]  # pyright: ignore[reportAttributeAccessIssue]
     env = changed("hover", {"motors": [motors[0], motors[0], *motors[2:]]})
-    for u in np.random.default_rng(0).random((8, 2)):
-        turn = env.symmetry(jnp.asarray(u, jnp.float32))
-        np.testing.assert_array_equal(turn.action, np.eye(4))
-        np.testing.assert_array_equal(turn.observation, np.eye(18))
+    found = draws(env, 8)
+    np.testing.assert_array_equal(found.action, np.broadcast_to(np.eye(4), found.action.shape))
+    np.testing.assert_array_equal(found.observation, np.broadcast_to(np.eye(18), found.observation.shape))
 
 
 def test_the_circle_is_turned_by_any_angle() -> None:
     """About z, evenly: its directions average out."""
-    env = worlds.make("circle")
-    draws = jnp.asarray(np.random.default_rng(0).random((4000, 2)), jnp.float32)
-    world = np.asarray(jax.vmap(env.symmetry)(draws).observation)[:, 9:12, 9:12]
+    world = draws(worlds.make("circle"), 4000).observation[:, 9:12, 9:12]
     angle = np.arctan2(world[:, 1, 0], world[:, 0, 0])
     counts, _ = np.histogram(angle, 8, (-np.pi, np.pi))
     assert counts.min() > 400

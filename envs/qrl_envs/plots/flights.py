@@ -62,7 +62,7 @@ def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None
         _circle(axes, reward)
         reach = reward.radius_m
     else:
-        axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="target")
+        axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="target position")
     half = _half_width(shown[:, :, 9:11], reach, task.evaluation.start.position_m)
     axes.set(xlabel="x [m], seen from above", ylabel="y [m]", aspect="equal", xlim=(-half, half), ylim=(-half, half))
 
@@ -71,7 +71,7 @@ def _circle(axes: Axes, target: CircleReward) -> None:
     """The target circle, dashed, with its direction."""
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     x, y = target.radius_m * np.cos(angle), target.radius_m * np.sin(angle)
-    axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="target")
+    axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="target circle")
     arrow = {"arrowstyle": "-|>", "color": "black", "mutation_scale": 22, "shrinkA": 0, "shrinkB": 0}
     for k in (22, 112):
         axes.annotate("", xy=(x[k + 3], y[k + 3]), xytext=(x[k], y[k]), arrowprops=arrow, zorder=6)
