@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 import pytest
 from matplotlib import image
@@ -25,7 +24,8 @@ from selenium.webdriver.support.ui import Select
 from cli_helpers import TINY, complaint, qrl
 from cross_targets import need
 from experiments.gallery import browser
-from qrl.evaluation.trained_run import EVALUATION_STARTS_SEED, Run
+from qrl.evaluation.starts import evaluation_starts
+from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import files
 from qrl_envs import measures, viewer
 from qrl_envs import task as tasks
@@ -187,8 +187,7 @@ def test_the_flights_are_those_of_evaluate(trained: Path, tmp_path: Path) -> Non
     """All 1,000 of them flown as `qrl export` does; the starts asked for are the ones of these indices."""
     run = shutil.copytree(trained, tmp_path / "run")
     data = view(run, "--starts", "917", "3", "917")
-    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), 1000)
-    flights = Run(run).fly(keys)
+    flights = TrainedRun.load(run).fly(evaluation_starts())
     assert [flight["start"] for flight in data["flights"]] == [917, 3]
     for flight in data["flights"]:
         seen = flights.observations[flight["start"]]

@@ -9,10 +9,12 @@ from brax.envs.fast import Fast
 
 import policies
 from cli_helpers import TINY, complaint, qrl
-from qrl.evaluation import trained_run
+from qrl.cli import export
+from qrl.evaluation import calibration
 from qrl.export import targets
-from qrl.export.kernel import PossibleOverflow
-from qrl.export.targets import ProofFailed
+from qrl.export.kernel import AccumulatorOverflow
+from qrl.export.quantize import UnsupportedNetwork
+from qrl.export.targets import VerificationFailed
 
 LEAST = ("--starts", "8", "--vectors", "500")
 FILES = policies.EMITTED | {"report.md"}
@@ -20,8 +22,8 @@ FILES = policies.EMITTED | {"report.md"}
 
 @pytest.fixture(autouse=True)
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few flights to calibrate on, and no Cortex-M: test_prove.py has those."""
-    monkeypatch.setattr(trained_run, "CALIBRATION_STARTS", 10)
+    """Few flights to calibrate on, and no Cortex-M: test_verify.py has those."""
+    monkeypatch.setattr(calibration, "STARTS", 10)
     monkeypatch.setattr(targets, "missing_tools", lambda: ["the cross compiler"])
 
 
@@ -39,7 +41,7 @@ def test_an_export_is_whole_and_the_same_again(run: Path, capsys: pytest.Capture
     """It replaces what was there, file by file."""
     assert qrl("export", run, *LEAST) == 0
     said = capsys.readouterr().out
-    assert "NOT proved on Cortex-M, nor measured: this machine lacks the cross compiler" in said
+    assert "skipped Cortex-M and its costs: the cross compiler not found" in said
     assert f"{run}/export/qrl_policy.c" in said
     first = contents(run / "export")
     assert set(first) == FILES
@@ -60,8 +62,8 @@ def test_an_export_is_whole_and_the_same_again(run: Path, capsys: pytest.Capture
     }
 
 
-@pytest.mark.parametrize("raised", [ProofFailed("M0: a bit differs"), PossibleOverflow("layer 0, output 1: past 2^31")])
-def test_a_proof_that_fails_leaves_what_was_there(
+@pytest.mark.parametrize("raised", [VerificationFailed("M0: a bit differs"), AccumulatorOverflow("layer 0: past 2^31")])
+def test_a_verification_that_fails_leaves_what_was_there(
     raised: Exception, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Exit code 1, one line; nothing where nothing was."""
@@ -69,7 +71,7 @@ def test_a_proof_that_fails_leaves_what_was_there(
     def fail(*_: object) -> None:
         raise raised
 
-    monkeypatch.setattr(trained_run, "prove" if isinstance(raised, ProofFailed) else "quantise", fail)
+    monkeypatch.setattr(export, "verify" if isinstance(raised, VerificationFailed) else "quantize", fail)
     before = contents(run)
     for had in (False, True):
         if had:
@@ -84,36 +86,34 @@ def test_a_proof_that_fails_leaves_what_was_there(
         assert not list(run.glob(".*"))
 
 
-def test_missed_gates_are_a_warning(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_failed_gates_are_a_warning(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An untrained policy: the first lines of the report, and exit code 0."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("qrl.export.report.Gate.met", property(lambda self: not self.name.startswith("action error, R")))
+        patch.setattr("qrl.export.report.Gate.passed", property(lambda self: not self.name.startswith("RMS action")))
         assert qrl("export", run, *LEAST) == 0
     title, empty, warning, *_ = (run / "export" / "report.md").read_text().splitlines()
     assert title.startswith("# pendulum: 3-4-1")
     assert not empty
-    assert warning.startswith("> **Warning: missed: action error, RMSE: ")
-    assert "MISSED" in capsys.readouterr().out
+    assert warning.startswith("> **Warning: failed: RMS action error ")
+    assert "FAILED" in capsys.readouterr().out
 
 
-def test_without_a_compiler_it_exports_unproved(
+def test_without_a_compiler_it_exports_unverified(
     run: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.undo()
-    monkeypatch.setattr(trained_run, "CALIBRATION_STARTS", 10)
+    monkeypatch.setattr(calibration, "STARTS", 10)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert qrl("export", run, *LEAST) == 0
     said, report = capsys.readouterr().out, (run / "export" / "report.md").read_text()
-    missing = ("on this machine: no C compiler (cc)", "this machine lacks arm-none-eabi-gcc, arm-none-eabi-size, qemu")
-    for what in missing:
-        assert re_in("NOT proved", what, said)
-        assert re_in("Not proved", what, report)
-    assert "held against the reference" not in said
-    assert "gave what the NumPy reference gives" not in report
-
-
-def re_in(head: str, what: str, text: str) -> bool:
-    return any(head in line and what in line for line in text.splitlines())
+    for skipped in (
+        "host: C compiler (cc) not found",
+        "Cortex-M and its costs: arm-none-eabi-gcc, arm-none-eabi-size, qemu-system-arm not found",
+    ):
+        assert f"skipped {skipped}\n" in said
+        assert f"- Skipped {skipped}.\n" in report
+    assert "verified" not in said
+    assert "Verified" not in report
 
 
 def test_a_foreign_environment_exports(
@@ -122,7 +122,7 @@ def test_a_foreign_environment_exports(
     """One of Brax's own, the one that compiles at once: all that is known of its ports is their order."""
     run = tmp_path / "run"
     assert qrl("train", "fast", "--out", run, "--episode-length", "20", *TINY.split()) == 0
-    assert "'fast' does not say its control period" in complaint(capsys, "export", run, *LEAST)
+    assert "'fast' does not define `dt`" in complaint(capsys, "export", run, *LEAST)
     monkeypatch.setattr(Fast, "dt", 0.02, raising=False)  # as all but this one do
     assert qrl("export", run, *LEAST) == 0
     manifest = json.loads((run / "export" / "manifest.json").read_text())
@@ -188,9 +188,9 @@ def test_a_network_without_a_form_is_refused(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(*_: object) -> None:
-        raise trained_run.Inexpressible("layer 1: a weight is not finite")
+        raise UnsupportedNetwork("layer 1: a weight is not finite")
 
-    monkeypatch.setattr(trained_run, "quantise", fail)
+    monkeypatch.setattr(export, "quantize", fail)
     assert complaint(capsys, "export", run, *LEAST) == f"qrl: {run}: layer 1: a weight is not finite\n"
     assert not (run / "export").exists()
 

@@ -14,8 +14,8 @@ import pytest
 
 import policies
 from cross_targets import need
-from policies import FLAT, HOVER, ODD, ORIGIN, PENDULUM
-from qrl.export import emit, targets
+from policies import FLAT, HOVER, ODD, PENDULUM, PROVENANCE
+from qrl.export import emit, targets, vectors
 from qrl.export import kernel as reference
 from qrl.export.policy import Policy
 from qrl.export.targets import STRICT
@@ -40,12 +40,12 @@ HOSTILE = {
 
 def files(sizes: tuple[int, ...] = HOVER, activation: str = "relu", policy: Policy | None = None) -> dict[str, str]:
     policy, kernel = policy or policies.policy(sizes, activation), policies.kernel(sizes, activation)
-    return emit.files(policy, kernel, emit.golden(policy, kernel))
+    return emit.files(policy, kernel, vectors.golden(policy, kernel))
 
 
 def named(**changes: str) -> Policy:
-    """The smallest policy, of another origin."""
-    return replace(policies.policy(ODD), origin=replace(ORIGIN, **changes))
+    """The smallest policy, of another provenance."""
+    return replace(policies.policy(ODD), provenance=replace(PROVENANCE, **changes))
 
 
 def compiled(folder: Path, *flags: str, sources: tuple[str, ...] = (SOURCE,), output: str = "object.o") -> None:
@@ -106,7 +106,7 @@ def test_the_manifest_keeps_its_contract() -> None:
     assert [port["unit"] for port in found["obs"]] == ["1"] * 9 + ["m"] * 3 + ["m/s"] * 3 + ["rad/s"] * 3
     for i, port in enumerate(found["obs"]):
         assert set(port) == {"name", "unit", "frame", "range", "steps", "lsb"}
-        assert port["steps"] == [kernel.least[i], kernel.most[i]]
+        assert port["steps"] == [kernel.obs_min[i], kernel.obs_max[i]]
         assert port["range"] == [pytest.approx(steps * port["lsb"]) for steps in port["steps"]]
     assert [(port["name"], port["unit"]) for port in found["act"]] == [(f"f{i}", "N") for i in range(1, 5)]
     a = 0.07425
@@ -153,10 +153,10 @@ def test_the_manifests_steps_are_the_kernels() -> None:
 def test_the_header_says_what_everything_is(sizes: tuple[int, ...]) -> None:
     policy, header = policies.policy(sizes), files(sizes)[HEADER]
     comment = header[: header.index("*/")]
-    for fact in ("hover", ORIGIN.description, "Run made-up", "seed 3", "1,234,567", "commit 0123456789ab"):
+    for fact in ("hover", PROVENANCE.description, "Run made-up", "seed 3", "1,234,567", "commit 0123456789ab"):
         assert fact in comment
     assert f"every {policy.control_period_s:g} s" in comment
-    for side, ports in (("OBS", policy.observed), ("ACT", policy.acted)):
+    for side, ports in (("OBS", policy.observations), ("ACT", policy.actions)):
         assert f"#define QRL_POLICY_{side}_SIZE {len(ports)}\n" in header
         for i, port in enumerate(ports):
             assert re.search(rf"\* +{i} +{port.name} +{re.escape(port.unit)} +-?[\d.]+ \.\. .*{port.frame}", comment)
@@ -189,7 +189,7 @@ def test_the_headers_steps_are_the_kernels() -> None:
 def test_golden_vectors_replay(sizes: tuple[int, ...]) -> None:
     policy, kernel = policies.policy(sizes), policies.kernel(sizes)
     header, *rows = csv.reader(files(sizes)["golden.csv"].splitlines())
-    names, acts = [port.name for port in policy.observed], [port.name for port in policy.acted]
+    names, acts = [port.name for port in policy.observations], [port.name for port in policy.actions]
     steps = [f"{name}_lsb" for name in names]
     assert header == [*names, *steps, "status", "status_i16", *(f"{name}_lsb" for name in acts)]
     assert len(rows) == 256
@@ -283,8 +283,8 @@ def test_the_example_builds_and_runs(exported: Exported, tmp_path: Path) -> None
         folder = shutil.copytree(exported[sizes, activation], tmp_path / f"{sizes[0]}")
         said = run("make", "-s", cwd=folder / EXAMPLE)
         names, values = said.strip().split(": ")
-        assert names.split() == [port.name for port in policy.acted]
-        wanted = reference.step(kernel, emit.golden(policy, kernel).obs[:1])[1][0]
+        assert names.split() == [port.name for port in policy.actions]
+        wanted = reference.step(kernel, vectors.golden(policy, kernel).obs[:1])[1][0]
         np.testing.assert_allclose([float(value) for value in values.split()], wanted, atol=6e-5)
         run("make", "-s", "clean", cwd=folder / EXAMPLE)
         assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} <= policies.EMITTED | {

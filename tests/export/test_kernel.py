@@ -15,7 +15,7 @@ import policies
 from policies import FLAT, HOVER, ODD, PENDULUM
 from qrl.export import kernel as reference
 from qrl.export import vectors
-from qrl.export.kernel import INT16, Dense, Kernel, PossibleOverflow, accumulator_bound
+from qrl.export.kernel import INT16, AccumulatorOverflow, Dense, Kernel, accumulator_bound
 
 SHAPES = pytest.mark.parametrize("sizes", [HOVER, PENDULUM, ODD, FLAT], ids=str)
 ACTIVATIONS = pytest.mark.parametrize("activation", ["relu", "tanh"])
@@ -60,7 +60,7 @@ def literal_network(kernel: Kernel, x: list[int]) -> list[int]:
             assert abs(acc) < 2**31
             z = acc * int(layer.multiplier[o]) // 2 ** (16 + layer.shift)
             if at == len(kernel.layers) - 1:
-                y.append(limited(limited(z, -(2**15), 2**15 - 1), int(kernel.act_least[o]), int(kernel.act_most[o])))
+                y.append(limited(limited(z, -(2**15), 2**15 - 1), int(kernel.act_min[o]), int(kernel.act_max[o])))
             elif kernel.activation == "relu":
                 y.append(limited(z, 0, 2**15 - 1))
             else:
@@ -71,7 +71,8 @@ def literal_network(kernel: Kernel, x: list[int]) -> list[int]:
 
 def literal(kernel: Kernel, wanted: list[int]) -> tuple[int, list[int]]:
     """Status and action in steps."""
-    x = [limited(q, int(least), int(most)) for q, least, most in zip(wanted, kernel.least, kernel.most, strict=True)]
+    limits = zip(wanted, kernel.obs_min, kernel.obs_max, strict=True)
+    x = [limited(q, int(low), int(high)) for q, low, high in limits]
     return int(x != wanted), literal_network(kernel, x)
 
 
@@ -118,14 +119,14 @@ def test_the_fixed_point_entry_is_the_literal_arithmetic(sizes: tuple[int, ...],
 def test_inputs_round_half_away_from_zero(data: st.DataObject) -> None:
     """Around every step and half-step, and anywhere."""
     kernel = policies.kernel(ODD)
-    i = data.draw(st.integers(0, len(kernel.most) - 1))
+    i = data.draw(st.integers(0, len(kernel.obs_max) - 1))
     halves, nudge = data.draw(st.integers(-65534, 65534)), data.draw(st.integers(-300, 300))
     exact = data.draw(st.booleans())
     bits = bits_of(halves / 2 * float(kernel.lsb[i])) if exact else data.draw(st.integers(0, 2**32 - 1))
     bits = limited(bits + nudge, 0, 2**32 - 1)
-    row = [0] * len(kernel.most)
+    row = [0] * len(kernel.obs_max)
     row[i] = bits
-    found, finite = reference.quantised(kernel, np.array([row], np.uint32).view(np.float32))
+    found, finite = reference.quantized(kernel, np.array([row], np.uint32).view(np.float32))
     wanted = literal_inputs(kernel, row)
     assert bool(finite[0]) == (wanted is not None)
     if wanted is not None:
@@ -138,7 +139,7 @@ def test_inputs_round_half_away_from_zero(data: st.DataObject) -> None:
 def test_extreme_floats_have_their_places() -> None:
     kernel = policies.kernel(PENDULUM)
     reals = np.array([0.0, -0.0, 1e-45, -1e-45, 1.1e-38, 3.4e38, -3.4e38], np.float32)
-    found, finite = reference.quantised(kernel, np.stack([reals, 0 * reals, 0 * reals], axis=1))
+    found, finite = reference.quantized(kernel, np.stack([reals, 0 * reals, 0 * reals], axis=1))
     assert finite.all()
     assert found[:5, 0].tolist() == [0] * 5
     assert found[5, 0] > INT16
@@ -160,13 +161,13 @@ def layered(rng: np.random.Generator, sizes: tuple[int, ...], activation: str = 
     return Kernel(
         scale=rng.integers(2**15, 2**16, inputs),
         exponent=rng.integers(130, 160, inputs),
-        least=rng.integers(-INT16, 1, inputs),
-        most=rng.integers(0, INT16 + 1, inputs),
+        obs_min=rng.integers(-INT16, 1, inputs),
+        obs_max=rng.integers(0, INT16 + 1, inputs),
         layers=layers,
         activation=activation,
         act_lsb=np.full(outputs, 1e-3, np.float32),
-        act_least=np.full(outputs, -INT16),
-        act_most=np.full(outputs, INT16),
+        act_min=np.full(outputs, -INT16),
+        act_max=np.full(outputs, INT16),
         act_safe=np.zeros(outputs, np.float32),
     )
 
@@ -188,12 +189,12 @@ def test_the_bound_is_attained_and_never_passed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kernel = layered(rng, (int(rng.integers(1, 40)), 8))
     (layer,) = kernel.layers
-    kernel = replace(kernel, least=-kernel.most)
+    kernel = replace(kernel, obs_min=-kernel.obs_max)
     bound = accumulator_bound(kernel)
-    worst = [np.sign(w) * kernel.most * (1 if b >= 0 else -1) for w, b in zip(layer.weight, layer.bias, strict=True)]
+    worst = [np.sign(w) * kernel.obs_max * (1 if b >= 0 else -1) for w, b in zip(layer.weight, layer.bias, strict=True)]
     accumulated = np.array(worst) @ layer.weight.T + layer.bias
     assert np.abs(accumulated).max() == bound
-    anything = rng.integers(kernel.least, kernel.most + 1, (200, len(kernel.most)))
+    anything = rng.integers(kernel.obs_min, kernel.obs_max + 1, (200, len(kernel.obs_max)))
     assert np.abs(anything @ layer.weight.T + layer.bias).max() <= bound
 
 
@@ -217,10 +218,10 @@ def test_a_possible_overflow_is_refused_from_2_to_the_31_on(over: int, refused: 
     before = Dense(np.zeros((400, 3), int), np.zeros(400, int), np.ones(400, int), 0)
     layers = (wide,) if at == 0 else (before, wide)
     kernel = layered(np.random.default_rng(0), (400 if at == 0 else 3, 1))
-    full = np.full(len(kernel.most), INT16)
-    kernel = replace(kernel, layers=layers, least=-full, most=full)
+    full = np.full(len(kernel.obs_max), INT16)
+    kernel = replace(kernel, layers=layers, obs_min=-full, obs_max=full)
     if refused:
-        with pytest.raises(PossibleOverflow, match=f"layer {at}, output 0: the sum of products can reach 2,147,483,6"):
+        with pytest.raises(AccumulatorOverflow, match=f"layer {at}, output 0: the accumulator can reach 2,147,483,6"):
             accumulator_bound(kernel)
     else:
         assert accumulator_bound(kernel) == 2**31 - 1
@@ -228,8 +229,8 @@ def test_a_possible_overflow_is_refused_from_2_to_the_31_on(over: int, refused: 
 
 def test_too_many_weights_are_refused() -> None:
     kernel = layered(np.random.default_rng(0), (1200, 2))
-    with pytest.raises(PossibleOverflow, match="layer 0"):
-        accumulator_bound(replace(kernel, least=np.full(1200, -INT16)))
+    with pytest.raises(AccumulatorOverflow, match="layer 0"):
+        accumulator_bound(replace(kernel, obs_min=np.full(1200, -INT16)))
 
 
 def test_products_are_summed_exactly() -> None:

@@ -1,4 +1,4 @@
-"""The prover is proved: on a small kernel with known answers, costs and stack, and on kernels with one fault each.
+"""Runs on targets are tested with a small kernel of known outputs, costs and stack, and with kernels of one fault.
 
 Without the cross compiler or QEMU the target's tests are skipped; QRL_REQUIRE_CROSS=1 makes that a failure.
 """
@@ -13,7 +13,8 @@ import pytest
 
 from cross_targets import EACH, EITHER, M0, M3, M4F, M7, need
 from qrl.export import baseline, targets
-from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, Outputs, ProofFailed
+from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, VerificationFailed
+from qrl.export.vectors import Outputs
 
 HEADER = """\
 #include <stdint.h>
@@ -83,7 +84,7 @@ def write(folder: Path, *faults: tuple[str, str], obs: int = 18, act: int = 4) -
 
 
 class Case(NamedTuple):
-    run: targets.Outputs
+    run: Outputs
     counts: Counts
 
 
@@ -169,7 +170,7 @@ def test_outputs_left_alone_show(core: Core | None, tmp_path: Path) -> None:
 def test_a_write_beyond_the_outputs_fails(entry: str, core: Core | None, tmp_path: Path) -> None:
     beyond = f"volatile int four = QRL_POLICY_ACT_SIZE; if (obs[0] == obs[0]) {{ act[four] = 0; }} /* end of {entry} */"
     kernel = write(tmp_path / "kernel", (f"/* end of {entry} */", beyond))
-    with pytest.raises(ProofFailed, match=rf"{'step_i16' if entry == 'i16' else 'step'} writes beyond its outputs"):
+    with pytest.raises(VerificationFailed, match=rf"{'step_i16' if entry == 'i16' else 'step'} writes past the end"):
         on(core, kernel, tmp_path)
 
 
@@ -177,7 +178,7 @@ def test_a_write_beyond_the_outputs_fails(entry: str, core: Core | None, tmp_pat
 def test_a_crash_fails(core: Core | None, tmp_path: Path) -> None:
     crash = f"if (obs[1] == {OBS_I16[ODD, 1]}) {{ void (*volatile nothing)(void) = 0; nothing(); }}"
     kernel = write(tmp_path / "kernel", ("/* end of i16 */", crash))
-    with pytest.raises(ProofFailed, match="host: the run broke off .signal" if core is None else "took a fault"):
+    with pytest.raises(VerificationFailed, match="host: the run failed .signal" if core is None else "processor fault"):
         on(core, kernel, tmp_path)
 
 
@@ -185,7 +186,7 @@ def test_a_crash_fails(core: Core | None, tmp_path: Path) -> None:
 def test_a_hang_fails(core: Core | None, tmp_path: Path) -> None:
     hang = f'while (obs[1] == {OBS_I16[ODD, 1]}) {{ __asm__ volatile(""); }}'
     kernel = write(tmp_path / "kernel", ("/* end of i16 */", hang))
-    with pytest.raises(ProofFailed, match=r"no end after 0.7 s"):
+    with pytest.raises(VerificationFailed, match=r"timed out after 0.7 s"):
         on(core, kernel, tmp_path, timeout_s=0.7)
 
 
@@ -203,18 +204,21 @@ LINE = (
 @pytest.mark.parametrize(
     ("selftest", "words"),
     [
-        ("exit(0);", "0 result lines"),
-        ("exit(3);", r"broke off \(exit 3\)"),
-        (f'fputs("qrl-proof: {LINE}\\n", stderr);', "2 result lines"),
-        (f'fputs("qrl-proof: {LINE}\\n", stderr); _exit(0);', "out.bin has"),
-        (f'fputs("qrl-proof: {LINE.replace("=18", "=3")}\\n", stderr); _exit(0);', "obs is 3, not 18"),
-        (f'fputs("qrl-proof: {LINE.replace("f32=3", "f32=2")}\\n", stderr); _exit(0);', "vectors_f32 is 201, not 301"),
+        ("exit(0);", "expected one result line, found 0"),
+        ("exit(3);", r"the run failed \(exit 3\)"),
+        (f'fputs("qrl-result: {LINE}\\n", stderr);', "expected one result line, found 2"),
+        (f'fputs("qrl-result: {LINE}\\n", stderr); _exit(0);', "out.bin: expected"),
+        (f'fputs("qrl-result: {LINE.replace("=18", "=3")}\\n", stderr); _exit(0);', "obs: expected 18, found 3"),
+        (
+            f'fputs("qrl-result: {LINE.replace("f32=3", "f32=2")}\\n", stderr); _exit(0);',
+            "vectors_f32: expected 301",
+        ),
     ],
 )
 def test_an_end_that_is_not_the_harnesss_own_fails(selftest: str, words: str, tmp_path: Path) -> None:
     heads = ("#include <string.h>", "#include <stdio.h>\n#include <stdlib.h>\n#include <string.h>\n#include <unistd.h>")
     kernel = write(tmp_path / "kernel", heads, ("/* selftest */", selftest))
-    with pytest.raises(ProofFailed, match=words):
+    with pytest.raises(VerificationFailed, match=words):
         targets.run_host(kernel, tmp_path, FIRMWARE, OBS_F32, OBS_I16)
 
 
@@ -223,14 +227,14 @@ def test_a_restart_on_a_core_fails(tmp_path: Path) -> None:
     kernel = write(
         tmp_path / "kernel", ("/* selftest */", "void (**volatile reset)(void) = (void (**)(void))4; (*reset)();")
     )
-    with pytest.raises(ProofFailed, match=r"no end after|took a fault"):
+    with pytest.raises(VerificationFailed, match=r"timed out after|processor fault"):
         on(M3, kernel, tmp_path, timeout_s=0.7)
 
 
 @EITHER
 def test_a_compilers_complaint_is_one_line(core: Core | None, tmp_path: Path) -> None:
     kernel = write(tmp_path / "kernel", ("/* selftest */", "int unused;"))
-    with pytest.raises(ProofFailed, match=r"gcc|cc|clang") as failure:
+    with pytest.raises(VerificationFailed, match=r"gcc|cc|clang") as failure:
         on(core, kernel, tmp_path)
     assert "unused" in str(failure.value)
     assert "\n" not in str(failure.value)
@@ -241,7 +245,7 @@ def test_a_compilers_complaint_is_one_line(core: Core | None, tmp_path: Path) ->
 def test_a_kernel_that_needs_more_than_libgcc_does_not_link(call: str, tmp_path: Path) -> None:
     heads = ("#include <string.h>", "#include <math.h>\n#include <stdlib.h>\n#include <string.h>")
     kernel = write(tmp_path / "kernel", heads, ("/* end of f32 */", f"act[0] = (float){call};"))
-    with pytest.raises(ProofFailed, match="undefined reference"):
+    with pytest.raises(VerificationFailed, match="undefined reference"):
         on(M3, kernel, tmp_path)
 
 
@@ -259,13 +263,13 @@ def test_instructions_are_counted_for_each_call(core: Core, cases: dict[str, Cas
 @EACH
 def test_a_clock_of_another_speed_fails(core: Core, tmp_path: Path) -> None:
     wrong = core._replace(tick=core.tick * 1.01)
-    with pytest.raises(ProofFailed, match="SysTick does not tick every"):
+    with pytest.raises(VerificationFailed, match="SysTick does not tick every"):
         on(wrong, write(tmp_path / "kernel"), tmp_path)
 
 
 def test_the_clock_is_held_to_its_error() -> None:
     targets.check_clock(M0, {0: 3.0, 1000: 2003.0 + targets.CLOCK_ERROR})
-    with pytest.raises(ProofFailed, match="a loop of 2003 instructions was measured as 1994"):
+    with pytest.raises(VerificationFailed, match="a loop of 2003 instructions was measured as 1994"):
         targets.check_clock(M0, {0: 3.0, 1000: 1994.0})
 
 
@@ -280,7 +284,7 @@ def test_the_stack_of_each_entry_is_seen(core: Core, cases: dict[str, Case]) -> 
 @pytest.mark.parametrize("core", [M0, M7], ids=["M0", "M7"], indirect=True)
 def test_a_stack_that_overflows_fails(core: Core, tmp_path: Path) -> None:
     kernel = write(tmp_path / "kernel", ("F32_STACK 1000", "F32_STACK 6200"))
-    with pytest.raises(ProofFailed, match=r"all of the stack|took a fault|broke off .signal"):
+    with pytest.raises(VerificationFailed, match=r"all of the stack|processor fault|the run failed .signal"):
         on(core, kernel, tmp_path)
 
 
@@ -305,7 +309,7 @@ def test_sizes(core: Core, tmp_path: Path) -> None:
 def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert targets.missing_tools() == ["arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"]
-    with pytest.raises(ProofFailed, match="no C compiler"):
+    with pytest.raises(VerificationFailed, match="no C compiler"):
         targets.run_host(tmp_path, tmp_path, RELEASE, OBS_F32, OBS_I16)
 
 

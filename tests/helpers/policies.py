@@ -7,14 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from qrl.export import emit
+from qrl.export import emit, vectors
 from qrl.export.kernel import Kernel
-from qrl.export.policy import ACTIVATIONS, Acted, Observed, Origin, Policy
-from qrl.export.quantise import quantise
+from qrl.export.policy import ACTIVATIONS, ActionSpec, ObservationSpec, Policy, Provenance
+from qrl.export.quantize import quantize
+from qrl.export.vectors import Vectors
 from qrl_envs import io_spec
 from qrl_envs import task as tasks
 
-ORIGIN = Origin("made-up", "hover", "reach a point and hover there", "0123456789ab", 3, 1_234_567)
+PROVENANCE = Provenance(
+    run="made-up",
+    task="hover",
+    description="reach a point and hover there",
+    commit="0123456789ab",
+    seed=3,
+    env_steps=1_234_567,
+)
 HOVER, PENDULUM, ODD, FLAT = (18, 64, 64, 4), (3, 64, 64, 1), (5, 7, 3, 2), (18, 4)
 
 # What an export holds, but for its report.
@@ -61,17 +69,17 @@ def odd_flights(rng: np.random.Generator, n: int) -> np.ndarray:
     return (middles + sizes * rng.normal(size=(n, 5))).astype(np.float32)
 
 
-def _ports(sizes: tuple[int, ...]) -> tuple[tuple[Observed, ...], tuple[Acted, ...]]:
+def _specs(sizes: tuple[int, ...]) -> tuple[tuple[ObservationSpec, ...], tuple[ActionSpec, ...]]:
     name = {(18, 4): "hover", (3, 1): "pendulum"}.get((sizes[0], sizes[-1]))
     if name:
         task = tasks.load(name)
         return (
-            tuple(Observed(*port) for port in io_spec.observations(task)),
-            tuple(Acted(*port) for port in io_spec.actions(task)),
+            tuple(ObservationSpec(**port._asdict()) for port in io_spec.observations(task)),
+            tuple(ActionSpec(**port._asdict()) for port in io_spec.actions(task)),
         )
     return (
-        tuple(Observed(f"o{i}", "?", "as it comes") for i in range(sizes[0])),
-        tuple(Acted(f"a{i}", "?", "as it comes", 0.5 * i, 2.0 + i, -1.5, 2.0, 0.25) for i in range(sizes[-1])),
+        tuple(ObservationSpec(f"o{i}", "?", "as it comes") for i in range(sizes[0])),
+        tuple(ActionSpec(f"a{i}", "?", "as it comes", 0.5 * i, 2.0 + i, -1.5, 2.0, 0.25) for i in range(sizes[-1])),
     )
 
 
@@ -84,12 +92,12 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
     rng = np.random.default_rng([seed, *sizes])
     flights = {18: hover_flights, 3: pendulum_flights, 5: odd_flights}[sizes[0]](rng, samples)
     normalised = sizes == ODD
-    observed, acted = _ports(sizes)
+    observations, actions = _specs(sizes)
     made = Policy(
-        origin=ORIGIN,
+        provenance=PROVENANCE,
         control_period_s=0.05 if sizes[0] == 3 else 0.01,
-        observed=observed,
-        acted=acted,
+        observations=observations,
+        actions=actions,
         observation_offset=flights.mean(axis=0, dtype=float) if normalised else np.zeros(sizes[0]),
         observation_gain=1.0 / flights.std(axis=0, dtype=float) if normalised else np.ones(sizes[0]),
         observation_clip=10.0 if normalised else np.inf,
@@ -119,13 +127,13 @@ def outputs(policy: Policy, observations: np.ndarray) -> np.ndarray:
 
 @cache
 def kernel(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0) -> Kernel:
-    """`policy` of the same arguments, quantised once for all tests."""
-    return quantise(policy(sizes, activation, seed))
+    """`policy` of the same arguments, quantized once for all tests."""
+    return quantize(policy(sizes, activation, seed))
 
 
-def emitted(folder: Path, policy: Policy, kernel: Kernel, golden: emit.Golden | None = None) -> Path:
+def emitted(folder: Path, policy: Policy, kernel: Kernel, golden: Vectors | None = None) -> Path:
     """All that is emitted but the report, written to `folder`."""
-    for name, text in emit.files(policy, kernel, golden or emit.golden(policy, kernel)).items():
+    for name, text in emit.files(policy, kernel, golden or vectors.golden(policy, kernel)).items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")

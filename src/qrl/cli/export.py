@@ -1,31 +1,133 @@
-"""`qrl export`: a run's policy as a C kernel, proved, measured and flown."""
+"""`qrl export`: the policy of a run as a C kernel, verified, flown and measured."""
 
 import argparse
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
+from numpy.typing import NDArray
+
+from qrl.algorithm.flights import Flights, summarize
 from qrl.cli.terminal import DONE, clock, console
-from qrl.evaluation import trained_run
-from qrl.export.report import gates
+from qrl.evaluation import calibration
+from qrl.evaluation.starts import evaluation_starts
+from qrl.evaluation.trained_run import TrainedRun
+from qrl.export import baseline, emit, vectors
+from qrl.export import kernel as reference
+from qrl.export.accuracy import accuracy
+from qrl.export.kernel import Kernel
+from qrl.export.policy import Policy
+from qrl.export.quantize import UnsupportedNetwork, quantize, si_layers
+from qrl.export.report import FlightStats, Measured, gates, report
+from qrl.export.verify import VerificationReport, verify
+from qrl_envs.specfile import BadInput
 
 
 def export(args: argparse.Namespace) -> int:
-    """Emit, prove and fly a run's integer policy; print gates and costs, leave it all in RUN/export."""
-    begun = time.perf_counter()
-    done = trained_run.export(trained_run.Run(args.run), args.starts, args.vectors, console.print)
-    proof = done.measured.proof
-    for name in proof.held:
-        console.print(f"held against the reference, bit for bit, on {proof.vectors:,} observations an entry: {name}")
-    for what in proof.missing:
-        console.print(f"NOT proved {what}")
-    for gate in gates(done.measured):
-        mark = "met" if gate.met else "MISSED"
-        console.print(f"{gate.name:<40} {gate.measured:>9.3g} {gate.unit:<20} bar {gate.bar:<6g} {mark}")
-    if proof.costs:
+    """Write RUN/export; print verification, gates and costs."""
+    start_time = time.perf_counter()
+    run = TrainedRun.load(args.run)
+    measured = export_run(run, args.starts, args.vectors, console.print)
+    verification = measured.verification
+    for name in verification.passed:
+        console.print(f"verified bit-exact ({verification.vectors:,} vectors per entry point): {name}")
+    for line in verification.skipped:
+        console.print(f"skipped {line}")
+    for gate in gates(measured):
+        console.print(f"{gate} {'ok' if gate.passed else 'FAILED'}")
+    if verification.costs:
         console.print(
             f"{'instructions per inference':<27} {'float entry':>12} {'i16 entry':>10} {'flash':>8} {'stack':>7}"
         )
-    for cost in proof.costs:
+    for cost in verification.costs:
         mean, mean_i16 = cost.step[0], cost.step_i16[0]
         console.print(f"{cost.core:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {cost.flash:>6,} B {max(cost.stack):>5} B")
-    console.print(f"done in {clock(time.perf_counter() - begun)}: {done.folder}/qrl_policy.c, .h, report.md")
+    duration = clock(time.perf_counter() - start_time)
+    console.print(f"done in {duration}: {run.folder / 'export'}/qrl_policy.c, .h, report.md")
     return DONE
+
+
+def export_run(run: TrainedRun, starts: int, vectors_per_entry: int, log: Callable[[str], None]) -> Measured:
+    """Quantize, emit, verify and fly the policy of `run`, and replace its folder `export` atomically.
+
+    Raises BadInput for a network that the kernel cannot represent, AccumulatorOverflow and VerificationFailed; the
+    previous `export` is then unchanged.
+    """
+    log("flying to calibrate")
+    policy = run.policy()
+    try:
+        kernel = quantize(policy)
+    except UnsupportedNetwork as error:
+        raise BadInput(f"{run.folder}: {error}") from None
+    target = run.folder / "export"
+    with TemporaryDirectory(dir=run.folder, prefix=".export-") as scratch, ThreadPoolExecutor(1) as pool:
+        folder = Path(scratch) / "export"
+        _write(folder, emit.files(policy, kernel, vectors.golden(policy, kernel)))
+        log("compiling and verifying; flying")
+        verification = pool.submit(verify, policy, kernel, folder, vectors_per_entry)
+        measured = _measured(run, policy, kernel, starts, verification.result)
+        _write(folder, {"report.md": report(policy, kernel, measured)})
+        previous = Path(scratch) / "previous"
+        if target.exists():
+            target.replace(previous)
+        try:
+            folder.replace(target)
+        except OSError:
+            if previous.exists():
+                previous.replace(target)
+            raise
+    return measured
+
+
+def _write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+def _measured(
+    run: TrainedRun, policy: Policy, kernel: Kernel, starts: int, verification: Callable[[], VerificationReport]
+) -> Measured:
+    """Fly both policies from the starts of an evaluation, then wait for the verification."""
+
+    def integer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        return reference.step(kernel, observation)[1]
+
+    network = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
+
+    def naive(observation: NDArray[np.float32]) -> NDArray[np.floating]:
+        outputs = baseline.infer(network, baseline.to_int8(network, observation))
+        return np.clip(outputs * network.act_scale, *policy.limits)
+
+    keys = evaluation_starts(starts)
+    float_flights = run.fly(keys)
+    integer_flights = run.fly_host_policy(integer, keys)
+    # Every step of the transient, where the errors are; the observations of a settled vehicle repeat.
+    observations = np.asarray(float_flights.observations[:, :-1])
+    transient = 2 * calibration.TRANSIENT_STEPS
+    parts = observations[:, :transient], observations[:, transient::4]
+    flown = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
+    flown = flown[np.isfinite(flown).all(axis=1)]
+    tail = run.tail_steps()
+    return Measured(
+        accuracy=accuracy(policy, integer, flown),
+        naive=accuracy(policy, naive, calibration.subsample(flown, calibration.SAMPLES)),
+        float_flights=_stats(policy, float_flights, tail),
+        integer_flights=_stats(policy, integer_flights, tail),
+        verification=verification(),
+    )
+
+
+def _stats(policy: Policy, flights: Flights, tail_steps: int) -> FlightStats:
+    low, high = policy.limits
+    actions = policy.to_si(np.asarray(flights.actions[:, -tail_steps:])) / (high - low)
+    return FlightStats(
+        summary=summarize(flights),
+        success=np.asarray(flights.measures["success"]) > 0.5 if "success" in flights.measures else None,
+        jitter=float(np.abs(np.diff(actions, axis=1)).mean()),
+        starts=len(flights.returns),
+    )

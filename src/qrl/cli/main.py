@@ -173,9 +173,9 @@ def _run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
     import jax
 
-    from qrl.export.kernel import PossibleOverflow
-    from qrl.export.targets import ProofFailed
-    from qrl.runs.integrity import IncompatibleCheckpoint
+    from qrl.export.kernel import AccumulatorOverflow
+    from qrl.export.targets import VerificationFailed
+    from qrl.runs.integrity import Foreign
     from qrl.training.driver import NotFinite
     from qrl_envs.specfile import BadInput
 
@@ -188,7 +188,7 @@ def _run(args: argparse.Namespace) -> int:
     except IncompatibleCheckpoint as error:
         complain(str(error))
         code = WRONG_INPUT
-    except (NotFinite, PossibleOverflow, ProofFailed) as error:
+    except (NotFinite, AccumulatorOverflow, VerificationFailed) as error:
         complain(str(error))
     except OSError as error:
         complain(f"{error.filename}: {error.strerror}" if error.filename else str(error))

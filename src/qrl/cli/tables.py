@@ -1,19 +1,19 @@
-"""What `qrl evaluate` prints: a column for each pilot, or for each condition that one flew in."""
+"""Tables of `qrl evaluate`: one column per policy or controller, or per condition."""
 
 import math
 from typing import Any
 
 from qrl.cli.terminal import console
-from qrl.evaluation.trained_run import STARTS
+from qrl.evaluation.starts import STARTS
 
-APART = ("seed", "starts", "failed")  # numbers that are no measure of a flight
-NAMED = 10  # failures by their index
+NOT_MEASURES = ("seed", "starts", "failed")
+LISTED = 10  # failed starts
 
 
 def table(columns: dict[str, dict[str, Any]]) -> None:
-    """One column for each of `columns`, one row for each number that the first of them has."""
+    """One column per entry of `columns`, one row per number in the first of them."""
     first = next(iter(columns.values()))
-    names = [name for name, x in first.items() if isinstance(x, int | float) and name not in APART]
+    names = [name for name, x in first.items() if isinstance(x, int | float) and name not in NOT_MEASURES]
     names = [name for name in names if not math.isnan(first[name])]
     widths = [max(11, len(head)) for head in columns]
     corner = max(len(name) for name in names)
@@ -26,25 +26,25 @@ def table(columns: dict[str, dict[str, Any]]) -> None:
 
 def checkpoints(result: dict[str, Any]) -> None:
     columns = {f"{one['env_steps']:,}": one for one in result["checkpoints"]}
-    console.print(f"\nseed {result['seed']}, its last {len(columns)} checkpoints by environment steps")
+    console.print(f"\nseed {result['seed']}, last {len(columns)} checkpoints by environment steps")
     table({head: {k: v for k, v in one.items() if k != "env_steps"} for head, one in columns.items()})
 
 
-def off_nominal(who: str, result: dict[str, Any]) -> None:
-    console.print(f"\n{who}")
+def off_nominal(title: str, result: dict[str, Any]) -> None:
+    console.print(f"\n{title}")
     nominal = {name: result[name] for name in next(iter(result["off_nominal"].values()))}
     table({"nominal": nominal, **result["off_nominal"]})
 
 
-def failures(who: str, result: dict[str, Any]) -> None:
-    """How many failed, and which of the starts those were."""
+def failures(name: str, result: dict[str, Any]) -> None:
+    """The number of failed starts, and the first of them."""
     listed = result["failures"]
-    console.print(f"{who}: {result['failed']:,} of {result['starts']:,} starts failed", end="")
+    console.print(f"{name}: {result['failed']:,} of {result['starts']:,} starts failed", end="")
     if not listed:
         console.print()
         return
-    first = " ".join(str(each["start"]) for each in listed[:NAMED])
-    more = " …" if result["failed"] > NAMED else ""
+    first = " ".join(str(each["start"]) for each in listed[:LISTED])
+    more = " …" if result["failed"] > LISTED else ""
     replay = f" (qrl view RUN --starts {first.split()[0]} replays one)" if listed[0]["start"] < STARTS else ""
     console.print(f": {first}{more}{replay}")
 

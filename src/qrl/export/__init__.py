@@ -1,1 +1,1 @@
-"""A policy as a microcontroller kernel: quantise -> integer reference -> C -> proof.  NumPy alone."""
+"""A policy as a microcontroller kernel: quantize -> integer reference -> C -> verification. NumPy alone."""

@@ -1,4 +1,4 @@
-"""The same network written the plain way, float32 and naive int8: what the kernel's costs and errors are set beside."""
+"""The same network in plain float32 and in naive int8: baselines for the kernel's costs and errors."""
 
 import shutil
 from collections.abc import Iterable, Sequence
@@ -17,13 +17,13 @@ _ACTIVATIONS = {"tanh": (np.tanh, "tanhf(x)"), "relu": (lambda x: np.maximum(x, 
 class NaiveLayer(NamedTuple):
     weight: Ints  # int8 [in, out]
     bias: Ints  # int32 [out]
-    multiplier: int  # an accumulator times this, shifted right by `shift`, is the next tensor's int8
+    multiplier: int  # accumulator·multiplier >> shift is the next tensor's int8
     shift: int
-    table: Ints | None  # int8 [256], of the activation; none after the last layer
+    table: Ints | None  # int8 [256], of the activation; None for the last layer
 
 
 class Naive(NamedTuple):
-    """An int8 network with one scale for each tensor: real = int8 · scale."""
+    """An int8 network with one scale per tensor: real = int8 · scale."""
 
     layers: list[NaiveLayer]
     obs_scale: float
@@ -32,7 +32,7 @@ class Naive(NamedTuple):
 
 def naive(layers: Layers, activation: str, obs: Floats) -> Naive:
     """`layers` in int8, each tensor scaled to its largest value over the observations [N, O]."""
-    x, quantised = np.asarray(obs, np.float64), list[NaiveLayer]()
+    x, quantized = np.asarray(obs, np.float64), list[NaiveLayer]()
     obs_scale = scale = _scale(x)
     for index, (weight, bias) in enumerate(layers):
         y = x @ weight + bias
@@ -45,18 +45,18 @@ def naive(layers: Layers, activation: str, obs: Floats) -> Naive:
             next_scale = _scale(x)
             table = _int8(_ACTIVATIONS[activation][0](np.arange(-128, 128) * y_scale), next_scale)
         bias_i32 = np.rint(bias / (scale * weight_scale)).astype(np.int32)
-        quantised.append(NaiveLayer(_int8(weight, weight_scale), bias_i32, multiplier, shift, table))
+        quantized.append(NaiveLayer(_int8(weight, weight_scale), bias_i32, multiplier, shift, table))
         scale = next_scale
-    return Naive(quantised, obs_scale, scale)
+    return Naive(quantized, obs_scale, scale)
 
 
 def to_int8(network: Naive, obs: Floats) -> Ints:
-    """Observations [N, O] as the int8 that the naive network reads, in int16."""
+    """Observations [N, O] as int8 inputs of the naive network, stored in int16."""
     return _int8(obs, network.obs_scale).astype(np.int16)
 
 
 def infer(network: Naive, obs: Ints) -> Ints:
-    """The naive network's outputs [N, A], int8 in int16, for observations of `to_int8`; times act_scale, reals."""
+    """Outputs [N, A] of the naive network, int8 in int16, for the result of `to_int8`; action = output·act_scale."""
     x = obs.astype(np.int64)
     for layer in network.layers:
         scaled = (x @ layer.weight.astype(np.int64) + layer.bias) * layer.multiplier
@@ -74,7 +74,7 @@ def _int8(values: Floats, scale: float) -> Ints:
 
 
 def data(layers: Layers, activation: str, obs: Floats) -> str:
-    """baseline_data.h: the weights that harness/baseline.c runs on."""
+    """baseline_data.h: the weights for harness/baseline.c."""
     network, parts, rows = naive(layers, activation, obs), list[str](), list[str]()
     for i, ((weight, bias), int8) in enumerate(zip(layers, network.layers, strict=True)):
         inputs, outputs = weight.shape
@@ -95,7 +95,7 @@ def data(layers: Layers, activation: str, obs: Floats) -> str:
 
 
 def _hex(values: Floats) -> Iterable[str]:
-    """float32 in C99's hexadecimal, which loses nothing."""
+    """float32 in C99's hexadecimal, which is exact."""
     return (f"{float(v).hex()}f" for v in np.asarray(values, np.float32).ravel())
 
 
@@ -104,7 +104,7 @@ def _array(kind: str, name: str, values: Iterable[str]) -> str:
 
 
 def write(folder: Path, layers: Layers, activation: str, obs: Floats) -> None:
-    """A kernel folder for `run_core(..., libraries=LIBRARIES)`; its int16 entry is the naive int8 network."""
+    """A kernel folder for `run_core(..., libraries=LIBRARIES)`; its int16 entry point is the naive int8 network."""
     folder.mkdir(parents=True, exist_ok=True)
     inputs, outputs = layers[0][0].shape[0], layers[-1][0].shape[1]
     header = (SOURCES / "baseline.h").read_text(encoding="utf-8")

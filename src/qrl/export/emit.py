@@ -1,11 +1,10 @@
-"""The kernel's files: C tables laid into the templates beside this module, manifest, golden vectors."""
+"""The files of an export: the C templates of this package filled with tables, the manifest, golden vectors."""
 
 import csv
 import io
 import json
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib import resources
 from importlib.resources.abc import Traversable
 from typing import Any
@@ -14,55 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrl.export import kernel as reference
-from qrl.export import vectors
-from qrl.export.kernel import Dense, Ints, Kernel
+from qrl.export.kernel import Dense, Kernel
 from qrl.export.policy import Policy
+from qrl.export.vectors import EMBEDDED, Vectors
 
 FORMAT = 1
 FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"
-EMBEDDED = 2  # golden vectors inside the C, for the self-test
 
 
-@dataclass(frozen=True, eq=False)
-class Golden:
-    """Observations and what the kernel answers, by the NumPy reference; leading axis [n]."""
-
-    obs: NDArray[np.float32]  # [n, F] in SI units
-    obs_i16: NDArray[np.int16]  # [n, F] in steps
-    status: Ints  # [n]
-    status_i16: Ints  # [n]
-    act: NDArray[np.int16]  # [n, A] in steps; the same for both entries where both inputs mean the same
-
-    @classmethod
-    def of(cls, kernel: Kernel, obs: NDArray[np.float32]) -> "Golden":
-        """The answers to finite observations [n, F]."""
-        wanted, _ = reference.quantised(kernel, obs)
-        obs_i16 = np.clip(wanted, -reference.INT16, reference.INT16).astype(np.int16)
-        status, _ = reference.step(kernel, obs)
-        status_i16, act = reference.step_i16(kernel, obs_i16)
-        return cls(obs, obs_i16, status, status_i16, act)
-
-
-def golden(policy: Policy, kernel: Kernel, n: int = 256) -> Golden:
-    """n finite vectors; the first ones, which the C embeds, are of a flight, and one that is clipped."""
-    obs = vectors.observations(policy, kernel, 2 * n)
-    found = Golden.of(kernel, obs[np.isfinite(obs).all(axis=1)])
-    clipped = int(np.argmax(found.status))
-    order = [*range(EMBEDDED - 1), clipped, *(i for i in range(EMBEDDED - 1, len(found.obs)) if i != clipped)]
-    thinned = [*order[:EMBEDDED], *order[EMBEDDED :: max(1, (len(order) - EMBEDDED) // (n - EMBEDDED))]][:n]
-    return Golden(
-        obs=found.obs[thinned],
-        obs_i16=found.obs_i16[thinned],
-        status=found.status[thinned],
-        status_i16=found.status_i16[thinned],
-        act=found.act[thinned],
-    )
-
-
-def files(policy: Policy, kernel: Kernel, golden: Golden) -> dict[str, str]:
-    """Everything that is emitted but the report: path in the export folder -> text."""
-    words = _words(policy, kernel, golden)
-    emitted = {path: _filled(text, words) for path, text in _templates(resources.files("qrl.export") / "templates")}
+def files(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
+    """All emitted files except the report: path in the export folder -> text."""
+    values = _values(policy, kernel, golden)
+    emitted = {path: _filled(text, values) for path, text in _templates(resources.files("qrl.export") / "templates")}
     emitted["manifest.json"] = json.dumps(manifest(policy, kernel), indent=2) + "\n"
     emitted["golden.csv"] = _golden_csv(policy, golden)
     return emitted
@@ -77,76 +39,76 @@ def _templates(folder: Traversable, path: str = "") -> Iterable[tuple[str, str]]
             yield name, entry.read_text(encoding="utf-8")
 
 
-def _filled(text: str, words: dict[str, str]) -> str:
-    """`text` with every @word@ replaced; KeyError for one that nobody knows."""
-    return re.sub(r"@(\w+)@", lambda match: words[match[1]], text)
+def _filled(text: str, values: dict[str, str]) -> str:
+    """`text` with every @placeholder@ replaced; KeyError if one is unknown."""
+    return re.sub(r"@(\w+)@", lambda match: values[match[1]], text)
 
 
 def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
-    """DESIGN.md's manifest.json."""
-    act_lsb = kernel.act_lsb.astype(float)
+    """manifest.json: ports with names, units, frames, ranges and steps, and where the policy comes from."""
+    act_lsb, run = kernel.act_lsb.astype(float), policy.provenance
     return {
         "format": FORMAT,
-        "task": policy.origin.task,
-        "run": policy.origin.run,
-        "commit": policy.origin.commit,
-        "seed": policy.origin.seed,
-        "env_steps": policy.origin.env_steps,
+        "task": run.task,
+        "run": run.run,
+        "commit": run.commit,
+        "seed": run.seed,
+        "env_steps": run.env_steps,
         "control_period_s": policy.control_period_s,
-        "network": [len(policy.observed), *(len(layer.bias) for layer in kernel.layers)],
+        "network": [len(policy.observations), *(len(layer.bias) for layer in kernel.layers)],
         "activation": kernel.activation,
         "obs": [
             {
                 "name": o.name,
                 "unit": o.unit,
                 "frame": o.frame,
-                "range": [float(bound[i] * kernel.lsb[i]) for bound in (kernel.least, kernel.most)],
-                "steps": [int(kernel.least[i]), int(kernel.most[i])],
+                "range": [float(bound[i] * kernel.lsb[i]) for bound in (kernel.obs_min, kernel.obs_max)],
+                "steps": [int(kernel.obs_min[i]), int(kernel.obs_max[i])],
                 "lsb": float(kernel.lsb[i]),
             }
-            for i, o in enumerate(policy.observed)
+            for i, o in enumerate(policy.observations)
         ],
         "act": [
             {"name": a.name, "unit": a.unit, "frame": a.frame}
             | ({} if a.position_m is None else {"position_m": list(a.position_m), "spin": a.spin})
             | {
-                "range": [kernel.act_least[i] * act_lsb[i], kernel.act_most[i] * act_lsb[i]],
+                "range": [kernel.act_min[i] * act_lsb[i], kernel.act_max[i] * act_lsb[i]],
                 "lsb": act_lsb[i],
                 "safe": float(kernel.act_safe[i]),
             }
-            for i, a in enumerate(policy.acted)
+            for i, a in enumerate(policy.actions)
         ],
     }
 
 
-def _words(policy: Policy, kernel: Kernel, golden: Golden) -> dict[str, str]:
-    """What the templates' @placeholders@ stand for."""
-    origin = policy.origin
+def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
+    """Values of the templates' @placeholders@."""
+    run = policy.provenance
     banner = [
-        f" * {origin.task}: {origin.description}.",
+        f" * {run.task}: {run.description}.",
         f" * A policy trained by qrl, exported as an integer network {_network(policy)} ({kernel.activation}).",
-        f" * Run {origin.run}, seed {origin.seed}, {origin.env_steps:,} environment steps, commit {origin.commit}.",
+        f" * Run {run.run}, seed {run.seed}, {run.env_steps:,} environment steps, commit {run.commit}.",
     ]
     return {
         "banner": "\n".join(_comment_safe(line) for line in banner),
-        "task": _comment_safe(origin.task),
+        "task": _comment_safe(run.task),
         "ports": "\n".join(f" * {_comment_safe(line)}".rstrip() for line in _port_lines(policy, kernel)),
-        "frames": FRAMES if any(port.spin is not None for port in policy.acted) else " * SI units.\n *",
-        "description_json": json.dumps(f"A trained policy for {origin.task} as an integer kernel"),
+        "frames": FRAMES if any(port.spin is not None for port in policy.actions) else " * SI units.\n *",
+        "description_json": json.dumps(f"A trained policy for {run.task} as an integer kernel"),
         "period_s": f"{policy.control_period_s:g}",
         "period_us": f"{round(policy.control_period_s * 1e6)}",
-        "obs_size": str(len(policy.observed)),
-        "act_size": str(len(policy.acted)),
+        "obs_size": str(len(policy.observations)),
+        "act_size": str(len(policy.actions)),
         "places": ",\n".join(
             f"    QRL_POLICY_{kind}_{port.name.upper()} = {i}"
-            for kind, ports in (("OBS", policy.observed), ("ACT", policy.acted))
+            for kind, ports in (("OBS", policy.observations), ("ACT", policy.actions))
             for i, port in enumerate(ports)
         ),
         "obs_lsb": _floats(kernel.lsb.astype(np.float32)),
-        "obs_least": ", ".join(map(str, kernel.least)),
-        "obs_most": ", ".join(map(str, kernel.most)),
+        "obs_least": ", ".join(map(str, kernel.obs_min)),
+        "obs_most": ", ".join(map(str, kernel.obs_max)),
         "act_lsb": _floats(kernel.act_lsb),
-        "act_names": " ".join(port.name for port in policy.acted),
+        "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
         "widest": str(max(_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers))),
@@ -156,24 +118,24 @@ def _words(policy: Policy, kernel: Kernel, golden: Golden) -> dict[str, str]:
 
 
 def _network(policy: Policy) -> str:
-    return "-".join(str(n) for n in (len(policy.observed), *(len(bias) for _, bias in policy.layers)))
+    return "-".join(str(n) for n in (len(policy.observations), *(len(bias) for _, bias in policy.layers)))
 
 
 def _comment_safe(text: str) -> str:
-    """Text on one line that neither begins nor ends a C comment, nor continues its line."""
+    """`text` on one line, without comment delimiters, line continuations or trigraphs."""
     text = "".join(c if c.isprintable() else " " for c in text.replace("\\", "|").replace("??/", "?? /"))
     return text.replace("*/", "* /").replace("/*", "/ *")
 
 
 def _port_lines(policy: Policy, kernel: Kernel) -> Iterable[str]:
-    lows, highs, act_lsb = kernel.least * kernel.lsb, kernel.most * kernel.lsb, kernel.act_lsb.astype(float)
+    lows, highs, act_lsb = kernel.obs_min * kernel.lsb, kernel.obs_max * kernel.lsb, kernel.act_lsb.astype(float)
     yield "obs  name        unit    range                  lsb        meaning"
-    for i, o in enumerate(policy.observed):
+    for i, o in enumerate(policy.observations):
         yield f"{i:>3}  {o.name:<11} {o.unit:<7} {lows[i]:>9.4g} .. {highs[i]:<9.4g} {kernel.lsb[i]:<10.4g} {o.frame}"
     yield ""
     yield "act  name        unit    range                  lsb        meaning"
-    for i, a in enumerate(policy.acted):
-        low, high = kernel.act_least[i] * act_lsb[i], kernel.act_most[i] * act_lsb[i]
+    for i, a in enumerate(policy.actions):
+        low, high = kernel.act_min[i] * act_lsb[i], kernel.act_max[i] * act_lsb[i]
         where = (
             "" if a.position_m is None else f"; motor at x {a.position_m[0]:+g} m, y {a.position_m[1]:+g} m of the body"
         )
@@ -191,17 +153,17 @@ def _padded(n: int) -> int:
     return -(-n // 4) * 4
 
 
-def _tables(kernel: Kernel, golden: Golden) -> str:
+def _tables(kernel: Kernel, golden: Vectors) -> str:
     sizes = [_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers)]
-    columns = kernel.scale, kernel.exponent, kernel.least, kernel.most
-    inputs = (f"{{{s}u, {e}, {least}, {most}}}" for s, e, least, most in zip(*columns, strict=True))
+    columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max
+    inputs = (f"{{{s}u, {e}, {low}, {high}}}" for s, e, low, high in zip(*columns, strict=True))
     parts = [
         f"#define LAYERS {len(kernel.layers)}\n#define PADDED_OBS_SIZE {sizes[0]}\n#define GOLDENS {EMBEDDED}",
         _array("struct input inputs[QRL_POLICY_OBS_SIZE]", inputs, 6),
         _array("float act_lsb[QRL_POLICY_ACT_SIZE]", map(_float, kernel.act_lsb), 4),
         _array("float act_safe[QRL_POLICY_ACT_SIZE]", map(_float, kernel.act_safe), 4),
-        _array("int16_t act_least[QRL_POLICY_ACT_SIZE]", kernel.act_least, 12),
-        _array("int16_t act_most[QRL_POLICY_ACT_SIZE]", kernel.act_most, 12),
+        _array("int16_t act_least[QRL_POLICY_ACT_SIZE]", kernel.act_min, 12),
+        _array("int16_t act_most[QRL_POLICY_ACT_SIZE]", kernel.act_max, 12),
     ]
     if kernel.activation == "tanh":
         parts.append(_array("int16_t tanh_table[257]", reference.tanh_table(), 16))
@@ -242,11 +204,11 @@ def _layer_tables(index: int, layer: Dense) -> str:
     )
 
 
-def _golden_rows(golden: Golden) -> Iterable[str]:
+def _golden_rows(golden: Vectors) -> Iterable[str]:
     for i in range(EMBEDDED):
-        obs_i16, act = (", ".join(map(str, x[i])) for x in (golden.obs_i16, golden.act))
+        obs_i16, act = (", ".join(map(str, x[i])) for x in (golden.obs_i16, golden.outputs.act_i16))
         columns = f"{{{_floats(golden.obs[i])}}}", f"{{{obs_i16}}}", f"{{{act}}}"
-        yield f"{{{', '.join(columns)}, {golden.status[i]}, {golden.status_i16[i]}}}"
+        yield f"{{{', '.join(columns)}, {golden.outputs.status[i]}, {golden.outputs.status_i16[i]}}}"
 
 
 def _array(declaration: str, values: Iterable[Any], columns: int) -> str:
@@ -259,7 +221,7 @@ def _lines(values: Iterable[str], columns: int) -> list[str]:
 
 
 def _float(value: np.floating) -> str:
-    """A C float literal that reads back as the same bits."""
+    """A C float literal with exactly these bits."""
     text = np.format_float_scientific(np.float32(value), unique=True)
     return f"{text}F"
 
@@ -268,15 +230,22 @@ def _floats(values: NDArray[np.float32]) -> str:
     return ", ".join(map(_float, values))
 
 
-def _golden_csv(policy: Policy, golden: Golden) -> str:
-    """A row for each vector: obs in SI units, in steps, status of each entry, act in steps."""
+def _golden_csv(policy: Policy, golden: Vectors) -> str:
+    """One row per vector: obs in SI units, obs in steps, status of each entry point, act in steps."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    names = [port.name for port in policy.observed]
-    acts = [f"{port.name}_lsb" for port in policy.acted]
+    names = [port.name for port in policy.observations]
+    acts = [f"{port.name}_lsb" for port in policy.actions]
     writer.writerow([*names, *(f"{name}_lsb" for name in names), "status", "status_i16", *acts])
+    outputs = golden.outputs
     for i in range(len(golden.obs)):
         writer.writerow(
-            [*map(str, golden.obs[i]), *golden.obs_i16[i], golden.status[i], golden.status_i16[i], *golden.act[i]]
+            [
+                *map(str, golden.obs[i]),
+                *golden.obs_i16[i],
+                outputs.status[i],
+                outputs.status_i16[i],
+                *outputs.act_i16[i],
+            ]
         )
     return out.getvalue()

@@ -1,6 +1,6 @@
-"""The policy that ships, as a value: weights, what each number in and out means, and where it has been.
+"""The deployed policy as a value: weights, names and units of inputs and outputs, provenance, calibration data.
 
-The only thing that crosses from training to export, so it needs NumPy alone.
+It is all that crosses from training to export, and needs NumPy alone.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Observed:
-    """One number that the policy sees."""
+class ObservationSpec:
+    """One number that the policy observes."""
 
     name: str
     unit: str
@@ -19,8 +19,8 @@ class Observed:
 
 
 @dataclass(frozen=True)
-class Acted:
-    """One number that the policy gives: clip(offset + scale·a, low, high) for a in [−1, 1], in `unit`."""
+class ActionSpec:
+    """One number that the policy outputs: clip(offset + scale·a, low, high) in `unit`, for a in [−1, 1]."""
 
     name: str
     unit: str
@@ -29,14 +29,19 @@ class Acted:
     scale: float
     low: float
     high: float
-    safe: float  # what to do when nothing better is known
+    safe: float  # the action when an observation is not finite
     position_m: tuple[float, float] | None = None  # of a motor: x, y in the body frame
-    spin: int | None = None  # of a motor: +1 where its reaction torque is positive about body z
+    spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest action for a in [−1, 1]."""
+        return max(self.low, self.offset - self.scale), min(self.high, self.offset + self.scale)
 
 
 @dataclass(frozen=True)
-class Origin:
-    """Where a policy comes from."""
+class Provenance:
+    """The run that trained a policy."""
 
     run: str
     task: str
@@ -53,13 +58,13 @@ Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outpu
 class Policy:
     """Deterministic policy in SI units: observation [..., F] -> action [..., A]."""
 
-    origin: Origin
+    provenance: Provenance
     control_period_s: float
-    observed: tuple[Observed, ...]
-    acted: tuple[Acted, ...]
-    observation_offset: NDArray[np.float64]  # [F] the network sees clip((o − offset)·gain, ±clip)·scale
+    observations: tuple[ObservationSpec, ...]
+    actions: tuple[ActionSpec, ...]
+    observation_offset: NDArray[np.float64]  # [F] the network's input is clip((o − offset)·gain, ±clip)·scale
     observation_gain: NDArray[np.float64]  # [F]
-    observation_clip: float  # infinite where there is none
+    observation_clip: float  # infinite without clipping
     observation_scale: NDArray[np.float64]  # [F]
     layers: tuple[Layer, ...]
     activation: str  # of all layers but the last: "relu" or "tanh"
@@ -72,26 +77,25 @@ class Policy:
         for weight, bias in self.layers[:-1]:
             x = ACTIVATIONS[self.activation](x @ weight + bias)
         weight, bias = self.layers[-1]
-        return self.in_units(x @ weight + bias)
+        return self.to_si(x @ weight + bias)
 
-    def in_units(self, a: NDArray[np.floating]) -> NDArray[np.float64]:
-        """The action [..., A] in SI units of the network's output a."""
+    def to_si(self, a: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Action [..., A] in SI units of the network's output a."""
         low, high = self.limits
         return np.clip(self.offset + self.scale * np.asarray(a, np.float64), low, high)
 
     @property
     def offset(self) -> NDArray[np.float64]:
-        return np.array([port.offset for port in self.acted])
+        return np.array([action.offset for action in self.actions])
 
     @property
     def scale(self) -> NDArray[np.float64]:
-        return np.array([port.scale for port in self.acted])
+        return np.array([action.scale for action in self.actions])
 
     @property
     def limits(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and greatest action [A] that there can be, with a in [−1, 1]."""
-        low = [max(port.low, port.offset - port.scale) for port in self.acted]
-        high = [min(port.high, port.offset + port.scale) for port in self.acted]
+        """Smallest and largest action [A] for a in [−1, 1]."""
+        low, high = zip(*(action.limits for action in self.actions), strict=True)
         return np.array(low), np.array(high)
 
 

@@ -1,8 +1,8 @@
-"""Compiles an emitted kernel and runs it: on this machine, and, measured, on four Cortex-M.
+"""Compiles an emitted kernel and runs it on the host and, with instruction counts, on four Cortex-M under QEMU.
 
-`harness/harness.c` runs both entries over files of observations, so that every output is at hand here, and ends with
-one line of text. What does not end with exactly one such line and a whole file of outputs raises `ProofFailed`.
-Each run has a folder of its own: several may go side by side.
+`harness/harness.c` runs both entry points over files of observations, writes all outputs to a file, and prints one
+result line at the end. A run without exactly one result line and a complete output file raises VerificationFailed.
+Each run has its own folder, so runs may be concurrent.
 """
 
 import os
@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+
+from qrl.export.vectors import Outputs
 
 Floats = np.ndarray[tuple[int, ...], np.dtype[np.floating]]
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.integer]]
@@ -31,16 +33,16 @@ STRICT = (
     "-Wshadow",
     "-O2",
 )
-FIRMWARE = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-ffast-math")  # what the least careful build does
-RELEASE = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")  # what sizes and counts are taken with
+FIRMWARE = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-ffast-math")  # the least careful build
+RELEASE = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")  # for sizes and instruction counts
 TIMEOUT_S = 60.0
-CLOCK_ERROR = 8  # instructions by which one measured call may be off: two rounds of the loops around it
-KNOWN_ROUNDS = (1000, 12345)  # of the loop of known length that the harness times in each run
-GUARD = 0xA5  # each byte behind the outputs, as the harness left it
+CLOCK_ERROR = 8  # instructions, per measured call: two rounds of the loops around it
+KNOWN_ROUNDS = (1000, 12345)  # of a loop of known length, timed in each run
+GUARD = 0xA5  # value of each byte after the outputs, set by the harness
 
 
 class Core(NamedTuple):
-    """A QEMU machine; `tick` is the instructions in a tick of its SysTick under `-icount shift=0`."""
+    """A QEMU machine; `tick`: instructions per tick of its SysTick under `-icount shift=0`."""
 
     name: str
     machine: str
@@ -60,22 +62,12 @@ CORES = (
 )
 
 
-class ProofFailed(RuntimeError):
-    """One line: what did not compile, run or end as it must."""
-
-
-class Outputs(NamedTuple):
-    """What a kernel answered to N float and M fixed-point observations."""
-
-    status: Ints  # int32 [N]
-    act: Floats  # float32 [N, A]
-    status_i16: Ints  # int32 [M]
-    act_i16: Ints  # int16 [M, A]
-    selftest: int
+class VerificationFailed(RuntimeError):
+    """A kernel does not compile or run, or differs from the reference; in one line."""
 
 
 class Counts(NamedTuple):
-    """Instructions of each call, to within CLOCK_ERROR, and the deepest stack of each entry, libraries included."""
+    """Instructions of each call, to within CLOCK_ERROR, and maximum stack of each entry point, libraries included."""
 
     f32: Floats  # float64 [N]
     i16: Floats  # float64 [M]
@@ -86,7 +78,7 @@ class Counts(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Bytes of qrl_policy.o, and of the library code that it pulls in."""
+    """Bytes of qrl_policy.o, and of the library code that it needs."""
 
     text: int
     data: int
@@ -99,12 +91,12 @@ def host_compiler() -> str | None:
 
 
 def missing_tools() -> list[str]:
-    """What `run_core` and `size` need and this machine lacks."""
+    """Tools that `run_core` and `size` need and this machine does not have."""
     missing = [
         tool for tool in ("arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm") if not shutil.which(tool)
     ]
     if "arm-none-eabi-gcc" not in missing:
-        # A library that it does not have, the compiler names without a folder.
+        # The compiler names a library that it does not have without a folder.
         library = subprocess.run(
             ["arm-none-eabi-gcc", "-print-file-name=libc.a"], capture_output=True, text=True, check=False
         ).stdout.strip()
@@ -121,14 +113,14 @@ def run_host(
     libraries: Sequence[str] = (),
     timeout_s: float = TIMEOUT_S,
 ) -> Outputs:
-    """What `kernel` (a folder) answers on this machine to observations [N, O] and [M, O], compiled with `flags`."""
+    """Outputs of `kernel` (a folder) on this machine for observations [N, O] and [M, O], compiled with `flags`."""
     compiler = host_compiler()
     if compiler is None:
-        raise ProofFailed("no C compiler on this machine (cc, gcc or clang)")
+        raise VerificationFailed("no C compiler on this machine (cc, gcc or clang)")
     folder = _folder(work, "host", obs_f32, obs_i16)
-    _build([compiler, *flags, *_sources(kernel, "host.c"), *libraries, "-o", "proof"], folder, "host")
-    said = _run([str(folder.resolve() / "proof")], folder, "host", timeout_s)
-    return _read(folder, "host", said, obs_f32, obs_i16)[0]
+    _build([compiler, *flags, *_sources(kernel, "host.c"), *libraries, "-o", "kernel"], folder, "host")
+    output = _run([str(folder.resolve() / "kernel")], folder, "host", timeout_s)
+    return _read(folder, "host", output, obs_f32, obs_i16)[0]
 
 
 def run_core(
@@ -141,25 +133,25 @@ def run_core(
     libraries: Sequence[str] = (),
     timeout_s: float = TIMEOUT_S,
 ) -> tuple[Outputs, Counts]:
-    """What `kernel` answers on `core`, and what that cost; linked with nothing but libc, libgcc and `libraries`."""
+    """Outputs and costs of `kernel` on `core`; linked with libc, libgcc and `libraries` only."""
     folder = _folder(work, core.name, obs_f32, obs_i16)
     memory = [f"-Wl,--defsym=FLASH_BYTES={core.flash_bytes}", f"-Wl,--defsym=RAM_BYTES={core.ram_bytes}"]
     link = ["-nostdlib", "-T", str(SOURCES / "cortex_m.ld"), *memory, *libraries, "-lc", "-lgcc"]
     sources = _sources(kernel, "startup.c")
-    _build(["arm-none-eabi-gcc", *core.flags, *flags, *sources, *link, "-o", "proof.elf"], folder, core.name)
-    said = _run(
+    _build(["arm-none-eabi-gcc", *core.flags, *flags, *sources, *link, "-o", "kernel.elf"], folder, core.name)
+    output = _run(
         ["qemu-system-arm", "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
-        + ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native", "-kernel", "proof.elf"],
+        + ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native", "-kernel", "kernel.elf"],
         folder,
         core.name,
         timeout_s,
     )
-    outputs, fields, ticks = _read(folder, core.name, said, obs_f32, obs_i16)
+    outputs, fields, ticks = _read(folder, core.name, output, obs_f32, obs_i16)
     return outputs, _counts(core, fields, ticks)
 
 
 def size(core: Core, kernel: Path, work: Path, flags: Sequence[str] = RELEASE, libraries: Sequence[str] = ()) -> Sizes:
-    """What the object file of `kernel` takes up on `core`, and the library code that it needs beside it."""
+    """Size of the object file of `kernel` on `core`, and of the library code that it needs."""
     folder = Path(tempfile.mkdtemp(prefix=f"{core.name}-size-", dir=work))
     compiler = ["arm-none-eabi-gcc", *core.flags]
     _build([*compiler, *flags, "-c", str(kernel.resolve() / "qrl_policy.c"), "-o", "qrl_policy.o"], folder, core.name)
@@ -194,7 +186,7 @@ def _build(command: list[str], folder: Path, where: str) -> str:
         command, cwd=folder, env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True, check=False
     )
     if done.returncode:
-        raise ProofFailed(
+        raise VerificationFailed(
             f"{where}: {Path(command[0]).name}: {_first(done.stderr, 'error|undefined|overflowed|will not fit')}"
         )
     return done.stdout
@@ -202,52 +194,53 @@ def _build(command: list[str], folder: Path, where: str) -> str:
 
 def _first(text: str, pattern: str) -> str:
     """The first line with `pattern` in it, else the last line."""
-    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["it said nothing"]
+    lines = [line.strip() for line in text.splitlines() if line.strip()] or ["no output"]
     return next((line for line in lines if re.search(pattern, line)), lines[-1])[:300]
 
 
 def _run(command: list[str], folder: Path, where: str, timeout_s: float) -> str:
-    """What the harness said; raises where it crashed or never ended."""
+    """The harness's stderr; VerificationFailed if it crashes or times out."""
     try:
         done = subprocess.run(
             command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
         )
     except subprocess.TimeoutExpired:
-        raise ProofFailed(f"{where}: no end after {timeout_s:g} s") from None
-    said = done.stderr.decode(errors="replace")
+        raise VerificationFailed(f"{where}: timed out after {timeout_s:g} s") from None
+    output = done.stderr.decode(errors="replace")
     if done.returncode:
         how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit {done.returncode}"
-        raise ProofFailed(f"{where}: the run broke off ({how}): {_first(said, 'qrl-proof-error|ERROR|Lockup')}")
-    return said
+        raise VerificationFailed(f"{where}: the run failed ({how}): {_first(output, 'qrl-error|ERROR|Lockup')}")
+    return output
 
 
-def _fields(said: str, where: str) -> dict[str, int]:
-    """What stands in the one result line."""
-    lines = [line for line in said.splitlines() if line.startswith("qrl-proof:")]
+def _fields(output: str, where: str) -> dict[str, int]:
+    """The fields of the result line."""
+    lines = [line for line in output.splitlines() if line.startswith("qrl-result:")]
     if len(lines) != 1:
-        raise ProofFailed(f"{where}: {len(lines)} result lines where there must be one")
+        raise VerificationFailed(f"{where}: expected one result line, found {len(lines)}")
     return {name: int(value) for name, value in re.findall(r"(\w+)=(-?\d+)", lines[0])}
 
 
 def _read(
-    folder: Path, where: str, said: str, obs_f32: Floats, obs_i16: Ints
+    folder: Path, where: str, output: str, obs_f32: Floats, obs_i16: Ints
 ) -> tuple[Outputs, dict[str, int], tuple[Ints, Ints]]:
-    """Outputs, the fields of the result line, and (ticks, spins) int32 [N, 2], [M, 2] of a run that ended well."""
-    fields = _fields(said, where)
+    """Outputs, the fields of the result line, and (ticks, spins) int32 [N, 2], [M, 2] of a complete run."""
+    fields = _fields(output, where)
     expected = {"obs": obs_f32.shape[1], "vectors_f32": len(obs_f32), "vectors_i16": len(obs_i16)}
-    if wrong := [f"{name} is {fields.get(name)}, not {n}" for name, n in expected.items() if fields.get(name) != n]:
-        raise ProofFailed(f"{where}: {', '.join(wrong)}")
+    found = {name: fields.get(name) for name in expected}
+    if wrong := [f"{name}: expected {n}, found {found[name]}" for name, n in expected.items() if found[name] != n]:
+        raise VerificationFailed(f"{where}: {', '.join(wrong)}")
     layouts = [
         np.dtype([("status", "<i4"), ("act", t, fields["act"]), ("guard", t, 2), ("elapsed", "<i4", 2)], align=True)
         for t in ("<f4", "<i2")
     ]
     data, split = (folder / "out.bin").read_bytes(), len(obs_f32) * layouts[0].itemsize
-    if len(data) != (whole := split + len(obs_i16) * layouts[1].itemsize):
-        raise ProofFailed(f"{where}: out.bin has {len(data)} bytes, not {whole}")
+    if len(data) != (length := split + len(obs_i16) * layouts[1].itemsize):
+        raise VerificationFailed(f"{where}: out.bin: expected {length} bytes, found {len(data)}")
     f32, i16 = np.frombuffer(data[:split], layouts[0]), np.frombuffer(data[split:], layouts[1])
     for records, entry in ((f32, "qrl_policy_step"), (i16, "qrl_policy_step_i16")):
         if np.any(np.ascontiguousarray(records["guard"]).view(np.uint8) != GUARD):
-            raise ProofFailed(f"{where}: {entry} writes beyond its outputs")
+            raise VerificationFailed(f"{where}: {entry} writes past the end of its outputs")
     outputs = Outputs(f32["status"], f32["act"], i16["status"], i16["act"], fields["selftest"])
     return outputs, fields, (f32["elapsed"], i16["elapsed"])
 
@@ -256,7 +249,7 @@ def _counts(core: Core, fields: dict[str, int], elapsed: tuple[Ints, Ints]) -> C
     def field(name: str) -> float:
         return float(_instructions(core, np.array([fields[f"{name}_ticks"], fields[f"{name}_spins"]])))
 
-    around = field("known_0") - known_instructions(0)  # what measuring itself takes
+    around = field("known_0") - known_instructions(0)  # overhead of the measurement
     check_clock(core, {rounds: field(f"known_{rounds}") - around for rounds in KNOWN_ROUNDS})
     f32, i16 = (_instructions(core, each) - around for each in elapsed)
     stacks = [fields[f"stack_{name}"] for name in ("f32", "i16", "selftest")]
@@ -264,7 +257,7 @@ def _counts(core: Core, fields: dict[str, int], elapsed: tuple[Ints, Ints]) -> C
 
 
 def _instructions(core: Core, elapsed: Ints) -> Floats:
-    """(ticks, spins) [..., 2] -> instructions [...]: from edge to edge, less the rounds spun after the call."""
+    """(ticks, spins) [..., 2] -> instructions [...]: from edge to edge, minus the rounds spun after the call."""
     return elapsed[..., 0] * core.tick - elapsed[..., 1] * 4.0
 
 
@@ -274,10 +267,10 @@ def known_instructions(rounds: int) -> int:
 
 
 def check_clock(core: Core, measured: dict[int, float]) -> None:
-    """ProofFailed unless `known`, called with these rounds, was measured at its length, in instructions."""
+    """Raise VerificationFailed unless `known` was measured at its length: rounds -> instructions."""
     for rounds, instructions in measured.items():
         if abs(instructions - known_instructions(rounds)) > CLOCK_ERROR:
-            raise ProofFailed(
+            raise VerificationFailed(
                 f"{core.name}: a loop of {known_instructions(rounds)} instructions was measured as {instructions:g}:"
                 f" SysTick does not tick every {core.tick:g} instructions here"
             )

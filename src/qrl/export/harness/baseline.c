@@ -1,5 +1,5 @@
-/* The same network written the plain way, behind the kernel's interface, to compare costs with:
-   qrl_policy_step is float32 with the C library's tanhf; qrl_policy_step_i16 is int8 with one scale for each tensor,
+/* The same network in plain C with the kernel's interface, as a baseline for costs:
+   qrl_policy_step is float32 with the C library's tanhf; qrl_policy_step_i16 is int8 with one scale per tensor,
    and its int16 arguments hold int8 values. */
 #include "qrl_policy.h"
 
@@ -10,9 +10,9 @@ struct layer {
     const float *weight, *bias; /* weights [outputs][inputs] */
     const int8_t *weight_i8;
     const int32_t *bias_i32;
-    int32_t multiplier; /* an accumulator times this, shifted right, is the next tensor's int8 */
+    int32_t multiplier; /* accumulator * multiplier >> shift is the next tensor's int8 */
     int shift;
-    const int8_t *table; /* of the activation, 256 entries; null: none */
+    const int8_t *table; /* of the activation, 256 entries; null for the last layer */
 };
 
 #include "baseline_data.h"

@@ -3,18 +3,18 @@
    Reads   f32.bin  observations, float32 little-endian [N, OBS]
            i16.bin  observations, int16 [M, OBS]
    Writes  out.bin  N records of one layout, then M of the other: status, act, guard, elapsed (below)
-   and, last of all, exactly one line of text that begins "qrl-proof:", with the counts, the self-test's
-   answer and what was measured. What goes wrong is said in a line that begins "qrl-proof-error:". */
+   and finally exactly one line of text that begins "qrl-result:", with counts, the self-test's result and the
+   measurements. An error is one line that begins "qrl-error:". */
 #include <string.h>
 
 #include "platform.h"
 #include "qrl_policy.h"
 
-/* A chunk's observations and records, both kinds, take at most 3.5 KB unless one vector takes more. */
+/* A chunk's observations and records of both kinds take at most 3.5 KB unless one vector takes more. */
 enum { OBS = QRL_POLICY_OBS_SIZE, ACT = QRL_POLICY_ACT_SIZE, POISON = 0xA5 };
 enum { EACH = OBS + ACT + 6, CHUNK = EACH < 560 ? 560 / EACH : 1 };
 
-/* The kernel writes into a poisoned record: an output that it leaves alone, or one too many, shows. */
+/* The kernel writes into a poisoned record, which reveals a missing output or one too many. */
 static struct record_f32 {
     int32_t status;
     float act[ACT];
@@ -32,21 +32,21 @@ static struct record_i16 {
 static float obs_f32[CHUNK][OBS];
 static int16_t obs_i16[CHUNK][OBS];
 
-static void need(int good, const char *otherwise)
+static void require(int good, const char *error)
 {
     if (!good) {
-        say("qrl-proof-error: ");
-        say(otherwise);
-        say("\n");
+        print_text("qrl-error: ");
+        print_text(error);
+        print_text("\n");
         finish(1);
     }
 }
 
-/* The next vectors of `file`, as many as fit a chunk; 0 at its end. */
+/* Reads the next vectors of `file`, as many as fit a chunk; returns their number, 0 at the end. */
 static uint32_t next_vectors(intptr_t file, void *into, uint32_t bytes_each)
 {
     uint32_t bytes = file_read(file, into, CHUNK * bytes_each);
-    need(bytes % bytes_each == 0, "an observation file ends within a vector");
+    require(bytes % bytes_each == 0, "an observation file ends within a vector");
     return bytes / bytes_each;
 }
 
@@ -55,14 +55,14 @@ static int32_t run_f32(intptr_t out)
     int32_t total = 0;
     uint32_t count;
     intptr_t in = file_open("f32.bin", 0);
-    need(in != 0, "f32.bin cannot be read");
+    require(in != 0, "f32.bin cannot be read");
     while ((count = next_vectors(in, obs_f32, sizeof obs_f32[0])) != 0) {
         memset(records_f32, POISON, sizeof records_f32);
         for (uint32_t i = 0; i < count; i++) {
             records_f32[i].status = call_f32(obs_f32[i], records_f32[i].act, &records_f32[i].elapsed);
         }
         uint32_t bytes = count * (uint32_t)sizeof records_f32[0];
-        need(file_write(out, records_f32, bytes) == bytes, "out.bin cannot be written");
+        require(file_write(out, records_f32, bytes) == bytes, "out.bin cannot be written");
         total += (int32_t)count;
     }
     file_close(in);
@@ -74,21 +74,21 @@ static int32_t run_i16(intptr_t out)
     int32_t total = 0;
     uint32_t count;
     intptr_t in = file_open("i16.bin", 0);
-    need(in != 0, "i16.bin cannot be read");
+    require(in != 0, "i16.bin cannot be read");
     while ((count = next_vectors(in, obs_i16, sizeof obs_i16[0])) != 0) {
         memset(records_i16, POISON, sizeof records_i16);
         for (uint32_t i = 0; i < count; i++) {
             records_i16[i].status = call_i16(obs_i16[i], records_i16[i].act, &records_i16[i].elapsed);
         }
         uint32_t bytes = count * (uint32_t)sizeof records_i16[0];
-        need(file_write(out, records_i16, bytes) == bytes, "out.bin cannot be written");
+        require(file_write(out, records_i16, bytes) == bytes, "out.bin cannot be written");
         total += (int32_t)count;
     }
     file_close(in);
     return total;
 }
 
-static char line[640] = "qrl-proof:";
+static char line[640] = "qrl-result:";
 
 /* Add " name=value" to the line. */
 static void report(const char *name, int32_t value)
@@ -117,7 +117,7 @@ int main(void)
 {
     struct elapsed elapsed;
     intptr_t out = file_open("out.bin", 1);
-    need(out != 0, "out.bin cannot be written");
+    require(out != 0, "out.bin cannot be written");
     report("obs", OBS);
     report("act", ACT);
     call_known(0, &elapsed);
@@ -136,8 +136,8 @@ int main(void)
     report("selftest", call_selftest(&elapsed));
     report("stack_selftest", stack_depth());
     report_elapsed("selftest_ticks", "selftest_spins", elapsed);
-    need(file_close(out) == 0, "out.bin cannot be written");
+    require(file_close(out) == 0, "out.bin cannot be written");
     strcat(line, "\n");
-    say(line);
+    print_text(line);
     finish(0);
 }

@@ -17,7 +17,7 @@ uint32_t file_write(intptr_t file, const void *from, uint32_t bytes)
 
 int file_close(intptr_t file) { return fclose((FILE *)file); }
 
-void say(const char *text) { fputs(text, stderr); }
+void print_text(const char *text) { fputs(text, stderr); }
 
 void finish(int code) { exit(code); }
 

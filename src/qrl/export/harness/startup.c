@@ -3,7 +3,7 @@
 
 #include "qrl_policy.h"
 
-/* Where the linker put things. In a table, since a compiler takes symbols at one address for different ones. */
+/* Addresses from the linker, in a table: compilers assume that different symbols have different addresses. */
 extern struct {
     uint32_t *data, *data_end, *data_image, *bss, *bss_end, *stack, *stack_end;
 } const layout;
@@ -39,7 +39,7 @@ intptr_t file_open(const char *name, int writing)
         length++;
     }
     uintptr_t arguments[3] = {(uintptr_t)name, writing ? 5 : 1, length}; /* as fopen's "wb" and "rb" */
-    return semihost(OPEN, arguments) + 1;                                /* -1 says that it failed, 0 is a handle */
+    return semihost(OPEN, arguments) + 1;                                /* -1: failed; 0 is a valid handle */
 }
 
 uint32_t file_read(intptr_t file, void *into, uint32_t bytes)
@@ -60,7 +60,7 @@ int file_close(intptr_t file)
     return (int)semihost(CLOSE, &argument);
 }
 
-void say(const char *text) { semihost(WRITE0, text); }
+void print_text(const char *text) { semihost(WRITE0, text); }
 
 void finish(int code)
 {
@@ -72,11 +72,11 @@ void finish(int code)
 
 void fault(void)
 {
-    say("qrl-proof-error: the processor took a fault\n");
+    print_text("qrl-error: processor fault\n");
     finish(1);
 }
 
-/* timed(obs, act, function, elapsed): the function's answer. Waits for an edge of SysTick, calls the function on the
+/* timed(obs, act, function, elapsed): the function's result. Waits for an edge of SysTick, calls the function on the
    kernel's stack, and counts rounds of four instructions until the next edge. */
 int timed(const void *obs, void *act, void (*function)(void), struct elapsed *elapsed);
 __asm__(".syntax unified\n"
@@ -151,7 +151,7 @@ int32_t stack_depth(void)
         word++;
     }
     if (word == layout.stack) {
-        say("qrl-proof-error: all of the stack was used, and perhaps more\n");
+        print_text("qrl-error: stack overflow: all of the stack was used\n");
         finish(1);
     }
     return (int32_t)((uintptr_t)layout.stack_end - (uintptr_t)word);
@@ -161,7 +161,7 @@ void reset(void)
 {
     volatile uint32_t *const systick = (volatile uint32_t *)0xE000E010u; /* control, reload, current */
 #ifdef __ARM_FP
-    *(volatile uint32_t *)0xE000ED88u |= 0xFu << 20; /* CPACR: the FPU is there for all */
+    *(volatile uint32_t *)0xE000ED88u |= 0xFu << 20; /* CPACR: enable the FPU */
     __asm__ volatile("dsb\n isb");
 #endif
     for (uint32_t *to = layout.data, *from = layout.data_image; to != layout.data_end;) {

@@ -1,18 +1,18 @@
 /*
 @banner@
- * See qrl_policy.h for what goes in and out, and for the licence (none needed).
+ * See qrl_policy.h for inputs, outputs and the license (unrestricted).
  */
 
 #include "qrl_policy.h"
 
 /*
- * An integer network: int8 weights with a scale for each output, int16 activations, int32 accumulators.
+ * An integer network: int8 weights with one scale per output, int16 activations, int32 accumulators.
  *
- *     acc = bias + sum(weight * x)                    at most @acc_bound@ in size, whatever x is: proved at export
- *     y   = saturate(floor(acc * multiplier / 2^(16 + shift)))          the half that rounds is part of the bias
+ *     acc = bias + sum(weight * x)                    |acc| <= @acc_bound@ for any x: proved at export
+ *     y   = saturate(floor(acc * multiplier / 2^(16 + shift)))          the bias includes the rounding half
  *
- * One arithmetic in three bodies, the same to the bit: Arm with the DSP extension (Cortex-M4, M7, M33 ...), Armv6-M
- * (Cortex-M0, M0+), and C99 for all else.
+ * Three implementations with identical results: Arm with the DSP extension (Cortex-M4, M7, M33 ...), Armv6-M
+ * (Cortex-M0, M0+), and C99 for all others.
  */
 #if defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
 #define BODY_DSP
@@ -24,12 +24,12 @@
 #define SATURATE
 #endif
 
-/* Negative numbers are shifted arithmetically below, which C99 leaves to the compiler. */
+/* The code below shifts negative numbers arithmetically; C99 leaves that to the compiler. */
 typedef char needs_arithmetic_right_shift[(-1 >> 1) == -1 ? 1 : -1];
 
 #ifdef BODY_ARMV6M
-/* These cores load a byte with an offset only unsigned. So u = w + 2^7, v = x + 2^15, modulo 2^32, where
-   sum(u v) = sum(w x) + 2^15 sum(w) + 2^7 sum(v): the second sum is known here, the third one is shared by all rows. */
+/* These cores load bytes with an offset as unsigned only. With u = w + 2^7, v = x + 2^15, modulo 2^32, where
+   sum(u v) = sum(w x) + 2^15 sum(w) + 2^7 sum(v): the second sum is a constant, the third is shared by all rows. */
 typedef uint8_t weight;
 typedef uint16_t activation;
 typedef uint32_t accumulator;
@@ -45,7 +45,7 @@ typedef int32_t accumulator;
 #define OFFSET 0
 #endif
 
-#ifdef BODY_DSP /* halfwords by twos */
+#ifdef BODY_DSP /* pairs of halfwords */
 typedef uint32_t factors;
 #define M2(m0, m1) (m0##u | m1##u << 16)
 #define FOUR 2
@@ -55,30 +55,30 @@ typedef uint16_t factors;
 #define FOUR 4
 #endif
 
-/* The weights of one output for four inputs. SXTB16 takes bytes 0 and 2, so the middle ones change places. */
+/* The weights of one output for four inputs. SXTB16 takes bytes 0 and 2, so the middle two are swapped. */
 #define W4(w0, w1, w2, w3) Q(w0), Q(w2), Q(w1), Q(w3)
 
 #define TANH @tanh@ /* else ReLU */
 
 union activations {
     activation one[@widest@];
-    int32_t two[@widest@ / 2]; /* by pairs, and so aligned */
+    int32_t two[@widest@ / 2]; /* pairs, aligned */
 };
 
 struct layer {
     const weight *weights; /* tiles of 4 outputs x 4 inputs, along the inputs first */
     const int32_t *biases;
     const factors *of_rows; /* below 2^15 */
-    uint16_t inputs;             /* inputs and outputs are multiples of 4, filled up with zeros */
+    uint16_t inputs;             /* inputs and outputs are multiples of 4, padded with zeros */
     uint16_t outputs;
-    uint8_t hidden;              /* else the last one, which has no activation */
+    uint8_t hidden;              /* 0: the last layer, without activation */
     uint8_t shift;
 };
 
 struct input {
     uint16_t scale;
     int16_t exponent; /* 1 / lsb = scale * 2^(142 - exponent) */
-    int16_t least;    /* in steps; beyond these it saturates */
+    int16_t least;    /* in steps; inputs saturate at least and most */
     int16_t most;
 };
 
@@ -91,14 +91,14 @@ struct golden {
 
 @tables@
 
-/* Four accumulators and what is added to them: the weights from `w` on times the activations from `x` to `last`. */
+/* Adds to four accumulators: the weights from `w` on times the activations from `x` to `last`. */
 struct four {
     accumulator a0, a1, a2, a3;
 };
 
 #if defined(BODY_DSP)
 
-/* A word holds four weights of one output: SXTB16 spreads the even bytes, then, after a turn, the odd ones. */
+/* A word holds four weights of one output: SXTB16 spreads the even bytes, then, rotated, the odd ones. */
 #define ROW(word, a)                          \
     "sxtb16 %[t], %[" word "]\n\t"            \
     "smlad  %[" a "], %[t], %[x0], %[" a "]\n\t" \
@@ -131,7 +131,7 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
     "add  %[" a "], %[t]\n\t"
 #define COLUMN(in, o0, o1, o2, o3) "ldrh %[in], [%[x], #" in "]\n\t" MAC(o0, "a0") MAC(o1, "a1") MAC(o2, "a2") MAC(o3, "a3")
 
-/* Two accumulators in low registers and two in those high ones that no compiler setting takes away. */
+/* Two accumulators in low registers, two in the high ones that no compiler setting reserves. */
 static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
     accumulator a0 = s->a0, a1 = s->a1;
     register accumulator a2 __asm__("r12");
@@ -186,7 +186,7 @@ static inline int32_t saturated(int32_t z) {
 
 #if TANH
 
-/* tanh of z * 6 / 2^15, by a table at every 2^8 and straight lines between. */
+/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8. */
 static inline int32_t activated(int32_t z) {
     z = saturated(z);
     const int16_t *const at = tanh_table + 128 + (z >> 8);
@@ -202,9 +202,9 @@ static inline int32_t activated(int32_t z) {
     __asm__("usat %0, #15, %1" : "=r"(z) : "r"(z));
     return z;
 #else /* without branches */
-    z &= (int32_t)((uint32_t)z >> 31) - 1; /* what is negative becomes 0 */
+    z &= (int32_t)((uint32_t)z >> 31) - 1; /* negative values become 0 */
     z -= 32767;
-    z &= -(int32_t)((uint32_t)z >> 31); /* and what is beyond 32767 becomes that */
+    z &= -(int32_t)((uint32_t)z >> 31); /* values beyond 32767 become 32767 */
     return z + 32767;
 #endif
 }
@@ -234,7 +234,7 @@ static inline void four_outputs(union activations *y, int at, const struct four 
 #else
 
 static inline activation output(accumulator acc, uint32_t factor, int shift, int hidden) {
-#ifdef BODY_ARMV6M /* by halves, for there is no 64-bit product */
+#ifdef BODY_ARMV6M /* by halves: there is no 64-bit product */
     const int32_t high = (int32_t)acc >> 16;
     const int32_t z = (high * (int32_t)factor + (int32_t)((uint16_t)acc * factor >> 16)) >> shift;
 #else
@@ -279,7 +279,7 @@ static void dense(const struct layer *l, const union activations *in, union acti
     }
 }
 
-/* From quantised inputs in `a`, filled up with zeros, to the outputs of the last layer, which it returns. */
+/* The outputs of the last layer, for quantized inputs in `a`, padded with zeros. */
 static const activation *network(union activations *a, union activations *b) {
     for (const struct layer *l = layers; l != layers + LAYERS; ++l) {
         dense(l, a, b);
@@ -295,7 +295,7 @@ static int16_t action(activation y, int i) {
     return (int16_t)(z < act_least[i] ? act_least[i] : z > act_most[i] ? act_most[i] : z);
 }
 
-/* Put one input in its place, saturated; 1 if that changed it. */
+/* Store one input, saturated; returns 1 if saturation changed it. */
 static int put(union activations *x, int i, int32_t q) {
     const int32_t least = inputs[i].least, most = inputs[i].most;
     const int32_t within = q > most ? most : q < least ? least : q;
@@ -309,8 +309,8 @@ static void fill_up(union activations *x) {
     }
 }
 
-/* Round x / lsb to an integer, x given by the bits of a finite float; beyond 32767 it may be anything beyond 32767.
-   With integers alone: no compiler flag can change it, and no core needs a floating-point library for it. */
+/* Round x / lsb to an integer, x given by the bits of a finite float; a result beyond 32767 is inexact, but beyond 32767.
+   In integers only: independent of compiler flags, and without a floating-point library. */
 static int32_t quantised(uint32_t bits, const struct input *in) {
     const int32_t right = in->exponent - (int32_t)(bits >> 23 & 255u);
     if (right > 32) {
@@ -329,7 +329,7 @@ int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_A
             float real;
             uint32_t bits;
         } in = {obs[i]};
-        if ((in.bits & 0x7f800000u) == 0x7f800000u) { /* by its bits: -ffast-math believes that no float is a NaN */
+        if ((in.bits & 0x7f800000u) == 0x7f800000u) { /* by its bits: -ffast-math assumes that no float is NaN */
             for (int j = 0; j < QRL_POLICY_ACT_SIZE; ++j) {
                 act[j] = act_safe[j];
             }
@@ -370,7 +370,7 @@ int qrl_policy_selftest(void) {
         int wrong = qrl_policy_step(goldens[k].obs, act) != goldens[k].status;
         wrong |= qrl_policy_step_i16(goldens[k].obs_i16, act_i16) != goldens[k].status_i16;
         for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
-            const volatile float wanted = (float)goldens[k].act[i] * act_lsb[i]; /* rounded, whatever registers hold */
+            const volatile float wanted = (float)goldens[k].act[i] * act_lsb[i]; /* rounded to float, also on x87 */
             wrong |= act_i16[i] != goldens[k].act[i] || !(act[i] == wanted);
         }
         if (wrong) {

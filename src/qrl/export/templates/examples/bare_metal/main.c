@@ -1,4 +1,4 @@
-/* How firmware calls the policy: test at boot, then every control period read, step, act. Runs on a desk too. */
+/* How firmware calls the policy: self-test at boot, then read, step, act every control period. Runs on a host too. */
 #include <stdio.h>
 
 #include "qrl_policy.h"
@@ -20,16 +20,16 @@ static void drive(const float act[QRL_POLICY_ACT_SIZE]) {
 int main(void) {
     const int failed = qrl_policy_selftest();
     if (failed) {
-        printf("self-test %d failed: this build does not compute the policy that was proved\n", failed);
+        printf("self-test %d failed: this build does not compute the policy that was verified\n", failed);
         return 1;
     }
     float obs[QRL_POLICY_OBS_SIZE], act[QRL_POLICY_ACT_SIZE];
     read_sensors(obs);
     const int status = qrl_policy_step(obs, act);
     if (status == 2) {
-        printf("not a number among the inputs: act holds the safe action; hand over to a fallback controller\n");
+        printf("an input is not finite: act holds the safe action; hand over to a fallback controller\n");
     } else if (status == 1) {
-        printf("an input was beyond the range it was calibrated for\n");
+        printf("an input is beyond its calibrated range\n");
     }
     drive(act);
     return 0;

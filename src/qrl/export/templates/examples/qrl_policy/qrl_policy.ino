@@ -20,7 +20,7 @@ void loop() {
   // Yours: fill obs from the state estimate, in the order, units and frames of qrl_policy.h.
   const int status = qrl_policy_step(obs, act);
   if (status == 2) {
-    // Not a number among the inputs: act holds the safe action; hand over to a fallback controller.
+    // An input is not finite: act holds the safe action; hand over to a fallback controller.
   }
   // Yours: act to motor commands.
 }

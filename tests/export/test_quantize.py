@@ -8,9 +8,9 @@ import pytest
 import policies
 from policies import FLAT, HOVER, ODD, PENDULUM
 from qrl.export import kernel as reference
-from qrl.export.kernel import INT16, Kernel, PossibleOverflow
+from qrl.export.kernel import INT16, AccumulatorOverflow, Kernel
 from qrl.export.policy import ACTIVATIONS, Policy
-from qrl.export.quantise import Inexpressible, quantise, si_layers
+from qrl.export.quantize import UnsupportedNetwork, quantize, si_layers
 
 ALL = [(sizes, activation) for sizes in (HOVER, PENDULUM, ODD, FLAT) for activation in ("relu", "tanh")]
 EACH_POLICY = pytest.mark.parametrize(("sizes", "activation"), ALL, ids=str)
@@ -19,8 +19,8 @@ EACH_POLICY = pytest.mark.parametrize(("sizes", "activation"), ALL, ids=str)
 def full_scales(policy: Policy, action: np.ndarray, observations: np.ndarray) -> np.ndarray:
     """Error of actions, by the formula written in policies.py and not by Policy."""
     low, high = policy.limits
-    a = policies.outputs(policy, observations) * [port.scale for port in policy.acted]
-    wanted = np.clip(a + [port.offset for port in policy.acted], low, high)
+    a = policies.outputs(policy, observations) * [port.scale for port in policy.actions]
+    wanted = np.clip(a + [port.offset for port in policy.actions], low, high)
     return (action - wanted) / (high - low)
 
 
@@ -94,9 +94,9 @@ def test_integers_are_close_on_flights_not_calibrated_on(activation: str) -> Non
 def test_ranges_cover_the_flights(sizes: tuple[int, ...], activation: str) -> None:
     """No observation that was met is clipped, and each has at least 9 bits of its range."""
     policy, kernel = policies.policy(sizes, activation), policies.kernel(sizes, activation)
-    assert (kernel.most * kernel.lsb >= policy.calibration.max(axis=0)).all()
-    assert (kernel.least * kernel.lsb <= policy.calibration.min(axis=0)).all()
-    reach = np.maximum(-kernel.least, kernel.most)
+    assert (kernel.obs_max * kernel.lsb >= policy.calibration.max(axis=0)).all()
+    assert (kernel.obs_min * kernel.lsb <= policy.calibration.min(axis=0)).all()
+    reach = np.maximum(-kernel.obs_min, kernel.obs_max)
     assert ((reach >= 500) & (reach <= INT16)).all()
     assert not reference.step(kernel, policy.calibration)[0].any()
 
@@ -116,13 +116,13 @@ def test_integers_fit_their_types() -> None:
 
 def arrays(kernel: Kernel) -> list[np.ndarray]:
     layers = [x for layer in kernel.layers for x in (layer.weight, layer.bias, layer.multiplier, np.array(layer.shift))]
-    rest = [kernel.scale, kernel.exponent, kernel.least, kernel.most, kernel.act_lsb]
-    return [*layers, *rest, kernel.act_least, kernel.act_most, kernel.act_safe]
+    rest = [kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max, kernel.act_lsb]
+    return [*layers, *rest, kernel.act_min, kernel.act_max, kernel.act_safe]
 
 
 @pytest.mark.parametrize("sizes", [PENDULUM, ODD], ids=str)
 def test_the_same_bits_twice(sizes: tuple[int, ...]) -> None:
-    first, second = policies.kernel(sizes), quantise(policies.policy(sizes))
+    first, second = policies.kernel(sizes), quantize(policies.policy(sizes))
     for one, other in zip(arrays(first), arrays(second), strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -132,13 +132,13 @@ def test_actions_stay_within_their_limits(sizes: tuple[int, ...], activation: st
     """Whatever is observed, and the limits are there in full."""
     policy, kernel = policies.policy(sizes, activation), policies.kernel(sizes, activation)
     rng = np.random.default_rng(0)
-    corners = np.where(rng.random((4000, sizes[0])) < 0.5, kernel.least, kernel.most) * kernel.lsb
+    corners = np.where(rng.random((4000, sizes[0])) < 0.5, kernel.obs_min, kernel.obs_max) * kernel.lsb
     wild = (corners * rng.uniform(0, 2, (4000, 1))).astype(np.float32)
     action = reference.step(kernel, wild)[1]
     low, high = policy.limits
     assert (action >= low - 0.5 * kernel.act_lsb).all()
     assert (action <= high + 0.5 * kernel.act_lsb).all()
-    for steps, limit in ((kernel.act_least, low), (kernel.act_most, high)):
+    for steps, limit in ((kernel.act_min, low), (kernel.act_max, high)):
         np.testing.assert_allclose(steps * kernel.act_lsb, limit, rtol=0, atol=0.51 * kernel.act_lsb.max())
 
 
@@ -165,8 +165,8 @@ def altered(sizes: tuple[int, ...], layer: int, **changes: np.ndarray) -> Policy
 
 
 def test_an_unknown_activation_is_refused() -> None:
-    with pytest.raises(Inexpressible, match="activation 'gelu': the kernel knows relu, tanh"):
-        quantise(replace(policies.policy(ODD), activation="gelu"))
+    with pytest.raises(UnsupportedNetwork, match="activation 'gelu': expected one of relu, tanh"):
+        quantize(replace(policies.policy(ODD), activation="gelu"))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -175,18 +175,18 @@ def test_a_weight_that_is_not_finite_is_refused(what: str, value: float) -> None
     for layer in range(3):
         changed = policies.policy(ODD).layers[layer][what == "bias"].copy()
         changed.flat[-1] = value
-        with pytest.raises(Inexpressible, match=f"layer {layer}: a weight is not finite"):
-            quantise(altered(ODD, layer, **{what: changed}))
+        with pytest.raises(UnsupportedNetwork, match=f"layer {layer}: a weight is not finite"):
+            quantize(altered(ODD, layer, **{what: changed}))
 
 
 @pytest.mark.parametrize("observations", [np.zeros((0, 5)), np.full((3, 5), np.nan)], ids=["none", "NaN"])
 def test_no_flight_to_calibrate_on_is_refused(observations: np.ndarray) -> None:
-    with pytest.raises(Inexpressible, match="no finite flight"):
-        quantise(replace(policies.policy(ODD), calibration=observations.astype(np.float32)))
+    with pytest.raises(UnsupportedNetwork, match="no finite flight"):
+        quantize(replace(policies.policy(ODD), calibration=observations.astype(np.float32)))
 
 
 def assert_close(policy: Policy, worst: float = 0.05) -> None:
-    kernel = quantise(policy)
+    kernel = quantize(policy)
     error = full_scales(policy, reference.step(kernel, policy.calibration)[1], policy.calibration)
     assert np.abs(error).max() <= worst
 
@@ -244,5 +244,5 @@ def test_a_layer_too_wide_for_32_bits_is_refused() -> None:
         (rng.choice([-1.0, 1.0], (5, 700)), rng.normal(size=700)),
         (rng.choice([-1.0, 1.0], (700, 2)) / 30, np.zeros(2)),
     )
-    with pytest.raises(PossibleOverflow, match="layer 1"):
-        quantise(replace(policy, layers=layers, calibration=policy.calibration[:100]))
+    with pytest.raises(AccumulatorOverflow, match="layer 1"):
+        quantize(replace(policy, layers=layers, calibration=policy.calibration[:100]))

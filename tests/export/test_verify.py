@@ -1,6 +1,6 @@
-"""The emitted C is the NumPy reference, to the bit, on the host and on four cores, at what the bars allow it to cost.
+"""The emitted C equals the NumPy reference bit for bit on the host and on four cores, within the limits of its costs.
 
-And where it is not, the proof says so. Without the cross tools the cores are skipped; QRL_REQUIRE_CROSS=1 fails then.
+Where it does not, verification fails. Without the cross tools the cores are skipped, or fail with QRL_REQUIRE_CROSS=1.
 """
 
 import re
@@ -18,11 +18,12 @@ import pytest
 import policies
 from cross_targets import EACH, EITHER, M0, M4F, need
 from policies import FLAT, HOVER, ODD, PENDULUM
-from qrl.export import emit, targets
 from qrl.export import kernel as reference
+from qrl.export import targets, vectors
 from qrl.export.kernel import Dense, Kernel
-from qrl.export.prove import Expected, compare, prove
-from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, Outputs, ProofFailed
+from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, VerificationFailed
+from qrl.export.vectors import Outputs, Vectors
+from qrl.export.verify import compare, verify
 
 MANY, FEW = 10_000, 600
 SANITISED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
@@ -31,8 +32,8 @@ BOTH = pytest.mark.parametrize("activation", ["relu", "tanh"])
 
 
 @cache
-def expected(sizes: tuple[int, ...], activation: str, n: int) -> Expected:
-    return Expected.of(policies.policy(sizes, activation), policies.kernel(sizes, activation), n)
+def expected(sizes: tuple[int, ...], activation: str, n: int) -> Vectors:
+    return vectors.draw(policies.policy(sizes, activation), policies.kernel(sizes, activation), n)
 
 
 @pytest.fixture(scope="module")
@@ -50,8 +51,8 @@ def kernel_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[int, 
 KernelOf = Callable[[tuple[int, ...], str], Path]
 
 
-def assert_same(found: Outputs, wanted: Expected) -> None:
-    """Written apart from prove.compare."""
+def assert_same(found: Outputs, wanted: Outputs) -> None:
+    """Written apart from verify.compare."""
     np.testing.assert_array_equal(found.status, wanted.status)
     np.testing.assert_array_equal(found.status_i16, wanted.status_i16)
     np.testing.assert_array_equal(found.act_i16, wanted.act_i16)
@@ -60,23 +61,23 @@ def assert_same(found: Outputs, wanted: Expected) -> None:
 
 
 def test_the_vectors_are_of_every_kind() -> None:
-    """What the proofs below rest on."""
+    """The tests below rely on it."""
     wanted, kernel = expected(HOVER, "relu", MANY), policies.kernel(HOVER)
     assert len(wanted.obs) == len(wanted.obs_i16) == MANY
-    assert min(np.bincount(wanted.status, minlength=3)) > 100
-    assert min(np.bincount(wanted.status_i16, minlength=2)) > 500
-    low, high = ((steps * kernel.lsb).astype(np.float32) for steps in (kernel.least, kernel.most))
+    assert min(np.bincount(wanted.outputs.status, minlength=3)) > 100
+    assert min(np.bincount(wanted.outputs.status_i16, minlength=2)) > 500
+    low, high = ((steps * kernel.lsb).astype(np.float32) for steps in (kernel.obs_min, kernel.obs_max))
     for vector in (low, high, 0 * high):
         assert (wanted.obs == vector).all(axis=1).any()
     for value in (0, 32767, -32767, -32768):
         assert (wanted.obs_i16 == value).all(axis=1).any()
-    assert ((wanted.obs_i16 == kernel.least) | (wanted.obs_i16 == kernel.most)).all(axis=1).sum() > 100
+    assert ((wanted.obs_i16 == kernel.obs_min) | (wanted.obs_i16 == kernel.obs_max)).all(axis=1).sum() > 100
     size = np.abs(wanted.obs)
     assert ((size > 0) & (size < 1.17e-38)).any()
     assert np.isnan(wanted.obs).any(axis=0).all()
     assert np.isinf(wanted.obs).any(axis=0).all()
-    act = wanted.act_i16
-    assert ((act == kernel.act_least).any(axis=0) & (act == kernel.act_most).any(axis=0)).all()
+    act = wanted.outputs.act_i16
+    assert ((act == kernel.act_min).any(axis=0) & (act == kernel.act_max).any(axis=0)).all()
     assert len(np.unique(act, axis=0)) > MANY // 4
 
 
@@ -112,7 +113,7 @@ def test_the_host_gives_the_references_bits(how: str, activation: str, kernel_of
         pytest.skip(f"this compiler cannot do {' '.join(flags)}")
     wanted = expected(HOVER, activation, MANY)
     found = targets.run_host(kernel_of(HOVER, activation), tmp_path, flags, wanted.obs, wanted.obs_i16)
-    assert_same(found, wanted)
+    assert_same(found, wanted.outputs)
 
 
 @EITHER
@@ -127,7 +128,7 @@ def test_odd_shapes_give_the_references_bits(
             found = targets.run_host(folder, tmp_path, SANITISED, wanted.obs, wanted.obs_i16)
         else:
             found, _ = targets.run_core(core, folder, tmp_path, RELEASE, wanted.obs, wanted.obs_i16)
-        assert_same(found, wanted)
+        assert_same(found, wanted.outputs)
 
 
 # -- on the cores --------------------------------------------------------------------------------------------
@@ -160,7 +161,7 @@ def cases(kernel_of: KernelOf, tmp_path_factory: pytest.TempPathFactory) -> Case
 def test_every_core_gives_the_references_bits(activation: str, core: Core, cases: Cases) -> None:
     wanted = expected(HOVER, activation, MANY)
     assert len(wanted.obs) >= 10_000
-    assert_same(cases[activation, core.name][0], wanted)
+    assert_same(cases[activation, core.name][0], wanted.outputs)
 
 
 BARS = {"M0": (34_000, 28_000), "M3": (None, 18_500), "M4F": (11_500, None), "M7": (11_500, None)}
@@ -187,9 +188,9 @@ def test_the_time_it_takes_hardly_varies(activation: str, core: Core, cases: Cas
     """Fixed trip counts: whatever is observed, within a twentieth of the mean; what is not finite ends early."""
     _, counts, _ = cases[activation, core.name]
     wanted = expected(HOVER, activation, MANY)
-    for each in (counts.i16, counts.f32[wanted.status < 2]):
+    for each in (counts.i16, counts.f32[wanted.outputs.status < 2]):
         assert np.ptp(each) < 0.1 * each.mean()
-    assert counts.f32[wanted.status == 2].max() < counts.f32.mean()
+    assert counts.f32[wanted.outputs.status == 2].max() < counts.f32.mean()
 
 
 @pytest.mark.parametrize("core", [M0, M4F], ids=["M0", "M4F"], indirect=True)
@@ -204,7 +205,7 @@ def test_the_assembly_bears_any_optimisation(
 ) -> None:
     wanted = expected(HOVER, activation, FEW)
     found, _ = targets.run_core(core, kernel_of(HOVER, activation), tmp_path, flags, wanted.obs, wanted.obs_i16)
-    assert_same(found, wanted)
+    assert_same(found, wanted.outputs)
 
 
 @pytest.mark.usefixtures("cross")
@@ -254,7 +255,7 @@ def test_bad_input_is_answered(core: Core | None, kernel_of: KernelOf, tmp_path:
         each.append(good.copy())
         each[-1][rows, rows] = value
     far = good.copy()
-    far[rows, rows] = 1.01 * np.where(rows % 2, kernel.most, kernel.least) * kernel.lsb
+    far[rows, rows] = 1.01 * np.where(rows % 2, kernel.obs_max, kernel.obs_min) * kernel.lsb
     obs, steps = np.concatenate([*each, far, good]), np.zeros((1, 18), np.int16)
     if core is None:
         found = targets.run_host(kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, obs, steps)
@@ -264,11 +265,11 @@ def test_bad_input_is_answered(core: Core | None, kernel_of: KernelOf, tmp_path:
     np.testing.assert_allclose(found.act[:72], 0.667 * 9.81 / 4, rtol=1e-3)
     assert np.isfinite(found.act).all()
     saturated = good.copy()
-    saturated[rows, rows] = np.where(rows % 2, kernel.most, kernel.least) * kernel.lsb
+    saturated[rows, rows] = np.where(rows % 2, kernel.obs_max, kernel.obs_min) * kernel.lsb
     np.testing.assert_array_equal(found.act[72:90], reference.step(kernel, saturated)[1])
 
 
-# -- the proof is able to fail -------------------------------------------------------------------------------
+# -- verification is able to fail -------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -277,20 +278,20 @@ def no_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("host", "no_cores")
-def test_a_sound_kernel_is_proved(kernel_of: KernelOf) -> None:
-    proof = prove(policies.policy(ODD), policies.kernel(ODD), kernel_of(ODD, "relu"), FEW)
-    assert proof.held == ["this machine", "this machine with -O3 -ffast-math"]
-    assert proof.missing == ["on Cortex-M, nor measured: this machine lacks the cross compiler"]
-    assert (proof.costs, proof.vectors) == ([], FEW)
+def test_a_sound_kernel_passes(kernel_of: KernelOf) -> None:
+    report = verify(policies.policy(ODD), policies.kernel(ODD), kernel_of(ODD, "relu"), FEW)
+    assert report.passed == ["host, -O2", "host, -O3 -ffast-math"]
+    assert report.skipped == ["Cortex-M and its costs: the cross compiler not found"]
+    assert (report.costs, report.vectors) == ([], FEW)
 
 
 @pytest.mark.usefixtures("cross", "host")
-def test_all_that_is_here_is_proved_and_measured(kernel_of: KernelOf) -> None:
-    proof = prove(policies.policy(ODD, "tanh"), policies.kernel(ODD, "tanh"), kernel_of(ODD, "tanh"), 300)
-    assert proof.held == ["this machine", "this machine with -O3 -ffast-math", "M0", "M3", "M4F", "M7"]
-    assert proof.missing == []
-    assert [cost.core for cost in proof.costs] == ["M0", "M3", "M4F", "M7"]
-    for cost in proof.costs:
+def test_every_target_is_verified_and_measured(kernel_of: KernelOf) -> None:
+    report = verify(policies.policy(ODD, "tanh"), policies.kernel(ODD, "tanh"), kernel_of(ODD, "tanh"), 300)
+    assert report.passed == ["host, -O2", "host, -O3 -ffast-math", "M0", "M3", "M4F", "M7"]
+    assert report.skipped == []
+    assert [cost.core for cost in report.costs] == ["M0", "M3", "M4F", "M7"]
+    for cost in report.costs:
         assert 100 < cost.step_i16[0] < cost.step[0] <= cost.step[1]
         assert cost.static_ram == 0
         assert cost.float32
@@ -322,38 +323,38 @@ FAULTS: dict[str, Callable[[Kernel], Kernel]] = {
     "a multiplier": lambda k: bumped(k, 1, "multiplier"),
     "a shift": lambda k: changed(k, 1, shift=k.layers[1].shift ^ 1),
     "rounding": lambda k: changed(k, -1, bias=without_rounding(k.layers[-1])),
-    "a limit": lambda k: replace(k, most=k.most - (np.arange(len(k.most)) == 0)),
+    "a limit": lambda k: replace(k, obs_max=k.obs_max - (np.arange(len(k.obs_max)) == 0)),
     "a scale": lambda k: replace(k, scale=k.scale - (np.arange(len(k.scale)) == 1)),
     "an exponent": lambda k: replace(k, exponent=k.exponent + (np.arange(len(k.scale)) == 0)),
     "the safe action": lambda k: replace(k, act_safe=np.nextafter(k.act_safe, np.float32(9))),
     "the step of an action": lambda k: replace(k, act_lsb=np.nextafter(k.act_lsb, np.float32(9))),
-    "the least action": lambda k: replace(k, act_least=k.act_least + 1),
+    "the least action": lambda k: replace(k, act_min=k.act_min + 1),
     "the activation": lambda k: replace(k, activation="tanh"),
 }
 
 
 @pytest.mark.usefixtures("host")
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS.keys())
-def test_one_step_of_a_difference_fails_the_proof(fault: Callable[[Kernel], Kernel], tmp_path: Path) -> None:
-    """Emitted from another kernel than it is held against; its golden vectors are not what finds it."""
+def test_one_step_of_a_difference_fails_verification(fault: Callable[[Kernel], Kernel], tmp_path: Path) -> None:
+    """Emitted from another kernel than the reference; its golden vectors do not reveal it."""
     policy, kernel = policies.policy(ODD), policies.kernel(ODD)
     other = fault(kernel)
-    folder = policies.emitted(tmp_path, policy, other, emit.golden(policy, other))
-    obs, obs_i16, *_ = wanted = expected(ODD, "relu", FEW)
-    found = targets.run_host(folder, tmp_path, ("-O0",), obs, obs_i16)
+    folder = policies.emitted(tmp_path, policy, other)
+    wanted = expected(ODD, "relu", FEW)
+    found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
     assert found.selftest == 0
-    with pytest.raises(ProofFailed, match=r"^here: .*qrl_policy_step.* differs from the reference in"):
-        compare("here", found, wanted)
+    with pytest.raises(VerificationFailed, match=r"^here: .*qrl_policy_step.* differs from the reference in"):
+        compare("here", found, wanted.outputs)
 
 
 @pytest.mark.usefixtures("host", "no_cores")
-def test_the_proof_of_another_kernel_fails(tmp_path: Path) -> None:
+def test_the_verification_of_another_kernel_fails(tmp_path: Path) -> None:
     policy, kernel = policies.policy(ODD), policies.kernel(ODD)
     other = bumped(kernel, -1, "bias")
     folder = policies.emitted(tmp_path, policy, other)
-    prove(policy, other, folder, FEW)
-    with pytest.raises(ProofFailed, match=r"^this machine: qrl_policy_step differs from the reference in"):
-        prove(policy, kernel, folder, FEW)
+    verify(policy, other, folder, FEW)
+    with pytest.raises(VerificationFailed, match=r"^host, -O2: qrl_policy_step differs from the reference in"):
+        verify(policy, kernel, folder, FEW)
 
 
 SOURCE_FAULTS = {
@@ -376,42 +377,44 @@ def test_a_slip_in_the_source_shows(fault: tuple[str, str], tmp_path: Path) -> N
     source = (folder / "qrl_policy.c").read_text()
     assert fault[0] in source
     (folder / "qrl_policy.c").write_text(source.replace(*fault))
-    wanted = Expected.of(policy, kernel, FEW)
+    wanted = vectors.draw(policy, kernel, FEW)
     found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
-    with pytest.raises(ProofFailed, match="differs from the reference"):
-        compare("here", found, wanted)
+    with pytest.raises(VerificationFailed, match="differs from the reference"):
+        compare("here", found, wanted.outputs)
 
 
 @pytest.mark.usefixtures("host")
-@pytest.mark.parametrize("table", ["obs", "obs_i16", "act", "status"])
+@pytest.mark.parametrize("table", ["obs", "obs_i16", "act_i16", "status"])
 def test_the_self_test_reads_its_table(table: str, tmp_path: Path) -> None:
-    """With another entry in a golden vector it fails, and the proof with it; all outputs are right."""
+    """With another entry in a golden vector it fails, and so does verification; all outputs are right."""
     policy, kernel = policies.policy(ODD), policies.kernel(ODD)
-    golden = emit.golden(policy, kernel)
-    values = getattr(golden, table).copy()
-    values[1] = values[1] + 1 if table in ("act", "status") else values[0]
-    folder = policies.emitted(tmp_path, policy, kernel, replace(golden, **{table: values}))
+    golden = vectors.golden(policy, kernel)
+    part = golden if table.startswith("obs") else golden.outputs
+    values = getattr(part, table).copy()
+    values[1] = values[0] if part is golden else values[1] + 1
+    part = part._replace(**{table: values})
+    golden = part if isinstance(part, Vectors) else golden._replace(outputs=part)
+    folder = policies.emitted(tmp_path, policy, kernel, golden)
     wanted = expected(ODD, "relu", FEW)
     found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
     assert found.selftest == 2
-    with pytest.raises(ProofFailed, match=r"here: the self-test failed \(2\)"):
-        compare("here", found, wanted)
+    with pytest.raises(VerificationFailed, match=r"here: the self-test failed \(2\)"):
+        compare("here", found, wanted.outputs)
 
 
 def test_a_difference_is_named() -> None:
-    wanted = expected(ODD, "relu", FEW)
-    outputs = Outputs(wanted.status, wanted.act, wanted.status_i16, wanted.act_i16, 0)
+    wanted = outputs = expected(ODD, "relu", FEW).outputs
     compare("M0", outputs, wanted)
     for name, value in (("status", 1), ("status_i16", 1), ("act_i16", 1)):
         wrong = getattr(wanted, name).copy()
         wrong[7] += value
-        with pytest.raises(ProofFailed, match=r"M0: .*_i16" if "i16" in name else r"M0: status of .*in vector 7"):
+        with pytest.raises(VerificationFailed, match=r"M0: .*_i16" if "i16" in name else "M0: status of .*in vector 7"):
             compare("M0", outputs._replace(**{name: wrong}), wanted)
     bit = wanted.act.copy()
     bit.view(np.int32)[9, 1] ^= 1
-    with pytest.raises(ProofFailed, match=r"M0: qrl_policy_step differs .* in 1 places, first in vector 9"):
+    with pytest.raises(VerificationFailed, match=r"M0: qrl_policy_step differs .* in 1 places, first in vector 9"):
         compare("M0", outputs._replace(act=bit), wanted)
-    with pytest.raises(ProofFailed, match=r"M0: status of qrl_policy_step: .* values, not"):
+    with pytest.raises(VerificationFailed, match=r"M0: status of qrl_policy_step: expected .* values, found"):
         compare("M0", outputs._replace(status=wanted.status[1:]), wanted)
-    with pytest.raises(ProofFailed, match=r"M0: the self-test failed \(-7\)"):
+    with pytest.raises(VerificationFailed, match=r"M0: the self-test failed \(-7\)"):
         compare("M0", outputs._replace(selftest=-7), wanted)
