@@ -27,6 +27,7 @@ from jax.sharding import PartitionSpec as P
 import qrl_envs  # noqa: F401 - registers our environments with Brax
 from judge import Act, Judge, pendulum_judge, success_judge
 from qrl.algorithm import flights as evaluate
+from qrl.evaluation.starts import evaluation_starts
 
 PENDULUM: dict[str, Any] = {
     "num_envs": 64,
@@ -46,7 +47,6 @@ QUADROTOR: dict[str, Any] = PENDULUM | {"num_envs": 256, "batch_size": 64, "unro
 EPISODE_STEPS = {"hover": 200, "circle": 600}
 EPISODES_A_CHECK = {"hover": 10, "circle": 3}
 NETWORKS: dict[str, Any] = {"policy_hidden_layer_sizes": (64, 64), "value_hidden_layer_sizes": (64, 64)}
-EVALUATION_STARTS_SEED = 1_000_003
 
 Policy = tuple[Callable[[Any, jax.Array], jax.Array], Any]  # of (params, observations), and params
 
@@ -93,7 +93,7 @@ def pendulum_judged(policy: Policy) -> Act:
 
 def flights(env: Any) -> Callable[[Policy], dict[str, float]]:
     """What 1,000 deterministic flights measure, as `qrl evaluate` has it; compiled once."""
-    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), 1000)
+    keys = evaluation_starts()
     fly = jax.jit(
         lambda act, params: evaluate.fly(env, partial(act, params), keys, env.episode_steps), static_argnums=0
     )

@@ -17,13 +17,12 @@ from qrl import request, tasks
 from qrl.algorithm import learner
 from qrl.algorithm.flights import summarize
 from qrl.config import load_preset, preset_names
+from qrl.evaluation.starts import evaluation_starts
 from qrl.runs import record
 from qrl.training import devices, driver
 from qrl.training.sharding import make_mesh
 from qrl.training.state import member_inputs, stack
 from qrl.training.trainer import Trainer, make_trainer
-
-STARTS, EVALUATION_STARTS_SEED = 1000, 1_000_003  # those of `qrl evaluate`
 
 
 def contestant(
@@ -61,7 +60,7 @@ def main() -> None:
     flags = {"apg_fraction": 0.0} if args.no_apg else {}
     trainer, points, run = contestant(args.task, args.preset, args.seed, flags)
     config = run.learner
-    keys = jax.random.split(jax.random.PRNGKey(EVALUATION_STARTS_SEED), STARTS)
+    keys = evaluation_starts()
 
     def flights(learners: Any) -> dict[str, float]:
         return summarize(jax.tree.map(lambda x: x[0], trainer.fly(learners, points, keys)))

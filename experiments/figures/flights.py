@@ -38,4 +38,5 @@ def fly_policy(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Po
     assert isinstance(task, QuadrotorTask)
     env = OffNominal(task, conditions(task)["trial"]) if trial else None
     flights = run.fly(evaluation_starts()[:starts], env)
-    return PolicyFlights(run.config.seed, run.env_steps, task, np.asarray(flights.observations), flights.measures)
+    measures = {name: np.asarray(value) for name, value in flights.measures.items()}
+    return PolicyFlights(run.config.seed, run.env_steps, task, np.asarray(flights.observations), measures)

@@ -66,6 +66,8 @@ def _controllers(task: QuadrotorTask) -> dict[str, Controller]:
 
 def _compiled(env: Any, controllers: Future[dict[str, Controller]], starts: chex.PRNGKey) -> Callable[..., Any]:
     def fly(params: Any, keys: chex.PRNGKey) -> dict[str, Flights]:
-        return {name: flights.fly(env.with_params(params), each, keys, 0) for name, each in controllers.result().items()}
+        return {
+            name: flights.fly(env.with_params(params), each, keys, 0) for name, each in controllers.result().items()
+        }
 
     return jax.jit(fly, compiler_options=xla_effort(1)).lower(env.params, starts).compile()

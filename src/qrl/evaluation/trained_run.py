@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from qrl import tasks
 from qrl.algorithm import flights
-from qrl.algorithm.flights import Flights
 from qrl.algorithm.adapter import adapt
+from qrl.algorithm.flights import Flights
 from qrl.algorithm.learner import MAX_NORMALIZED, LearnerState
 from qrl.algorithm.running_statistics import std
 from qrl.algorithm.types import Env, State
@@ -102,7 +102,11 @@ class TrainedRun:
             return jax.tree.map(partial(jnp.where, in_envelope), *states)
 
         return flights.fly(
-            self.env, mean, starts, self.max_episode_steps, lambda env, keys: jax.vmap(partial(reset, env))(in_envelope, keys)
+            self.env,
+            mean,
+            starts,
+            self.max_episode_steps,
+            lambda env, keys: jax.vmap(partial(reset, env))(in_envelope, keys),
         )
 
     def policy(self) -> Policy:
