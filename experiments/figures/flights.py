@@ -33,7 +33,7 @@ def fly_policy(folder: Path, *, trial: bool = False, starts: int = STARTS) -> Po
     With `trial`, the initial position and velocity are those of the paper's trial; attitude, which the paper does not
     give, and body rates are those of the start. Raises BadInput or OSError where the run cannot be read.
     """
-    run = TrainedRun.load(record.members(folder, tasks.load_run_config(folder))[0])
+    run = TrainedRun.load(record.member_folders(folder, tasks.load_run_config(folder))[0])
     task = run.task
     assert isinstance(task, QuadrotorTask)
     env = OffNominal(task, conditions(task)["trial"]) if trial else None

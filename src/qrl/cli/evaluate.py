@@ -77,7 +77,7 @@ def _seed_runs(folder: Path, config: RunConfig, eval_envs: EvalEnvs, executor: E
     programs = FlightPrograms(eval_envs.envs[NOMINAL], config.learner)
     for env in eval_envs.kinds.values():
         programs.compile(env, eval_envs.starts, executor)
-    return [SeedRun(member, programs) for member in record.members(folder, config)]
+    return [SeedRun(member, programs) for member in record.member_folders(folder, config)]
 
 
 def _conditions(folder: Path, config: RunConfig, task: Task | None) -> dict[str, Condition]:

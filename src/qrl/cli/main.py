@@ -175,7 +175,7 @@ def _run(args: argparse.Namespace) -> int:
 
     from qrl.export.kernel import AccumulatorOverflow
     from qrl.export.targets import VerificationFailed
-    from qrl.runs.integrity import Foreign
+    from qrl.runs.integrity import IncompatibleCheckpoint
     from qrl.training.driver import NotFinite
     from qrl_envs.specfile import BadInput
 

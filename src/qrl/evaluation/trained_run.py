@@ -64,7 +64,7 @@ class TrainedRun:
         """The last `most` checkpoints, newest first, each read when it is needed; otherwise as `load`."""
         config = tasks.load_run_config(folder)
         if config.seeds > 1:
-            one = record.members(folder, config)[0]
+            one = record.member_folders(folder, config)[0]
             raise BadInput(f"{folder}: holds {config.seeds} seeds; name one of them, such as RUN={one}")
         programs = programs or FlightPrograms(tasks.environment(config.task), config.learner)
         try:
