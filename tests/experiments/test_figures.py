@@ -22,8 +22,7 @@ from experiments.figures import runs as figure_runs
 from experiments.figures.captions import CONFIRMED, EXCEEDED, NOT, Provenance
 from experiments.figures.flights import PolicyFlights
 from experiments.figures.plots import Curves, Rate
-from experiments.figures.runs import CODE, Wanted
-from qrl.algorithm.learner import LearnerState
+from experiments.figures.runs import CODE, RunSpec
 from qrl.config import load_preset
 from qrl.evaluation.starts import evaluation_starts
 from qrl.runs import files, record
@@ -290,19 +289,19 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     small = HOVER._replace(flags={"policy_hidden_layer_sizes": (4,), "critic_hidden_layer_sizes": (4,)}, seeds=1)
     folder, config = folder_of(tmp_path / "run", small), small.config()
 
-    def untrained(*_: object) -> Iterator[tuple[LearnerState, int]]:
+    def untrained(*_: object) -> Iterator[tuple[Any, int]]:
         env = worlds.make("hover")
-        inputs = stack([member_inputs(env, config.learner)])
-        yield make_trainer(env, config.learner).init(seeds(0, 1), inputs).learner, 7
+        trainer = make_trainer(env, config.learner)
+        yield trainer.init(seeds(0, 1), stack([member_inputs(env, config.learner)])).learner, 7
 
     monkeypatch.setattr(restore, "iter_learners", untrained)
-    trial, nominal = (figure_flights.flown(folder, trial=trial, starts=2) for trial in (True, False))
+    trial, nominal = (figure_flights.fly_policy(folder, trial=trial, starts=2) for trial in (True, False))
     for began in trial.observations[:, 0]:
         np.testing.assert_allclose(began[9:15], [-1.58, 0.99, 1.45, -2.39, 6.20, 0.77], rtol=1e-6)
     others = [*range(9), 15, 16, 17]
     np.testing.assert_array_equal(trial.observations[:, 0, others], nominal.observations[:, 0, others])
     env = worlds.make("hover").evaluation().env
-    starts = jax.vmap(env.reset)(evaluation_starts(2)).obs
+    starts = jax.vmap(env.reset)(evaluation_starts(2)).obs  # those of `qrl evaluate`
     np.testing.assert_allclose(nominal.observations[:, 0], starts, rtol=1e-5, atol=1e-6)
     assert (trial.seed, trial.env_steps, trial.observations.shape) == (0, 7, (2, 801, 18))
     assert trial.measures["success"].shape == (2,)
