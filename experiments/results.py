@@ -189,9 +189,7 @@ def cells(measures: dict[str, float | None]) -> list[str]:
             return "never" if name.startswith("settle") and name in measures else "–"
         return f"{factor * value:{form}}{unit}"
 
-    steady = [
-        f"{label}{cell(name, factor, form, unit)}" for name, label, factor, form, unit in STEADY if name in measures
-    ]
+    steady = [label + cell(name, factor, form, unit) for name, label, factor, form, unit in STEADY if name in measures]
     return [
         cell("return_mean", 1.0, ".1f", ""),
         cell("success", 100.0, ".1f", " %"),

@@ -24,8 +24,11 @@ settings.load_profile("default")
 
 @pytest.fixture(scope="session", autouse=True)
 def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """One for each worker of pytest-xdist: JAX writes its entries in place, so another might read half of one."""
-    folder = str(tmp_path_factory.mktemp("xla"))
+    """One for all workers of pytest-xdist. An entry read while another worker writes it fails to decompress, and JAX
+    compiles instead.
+    """
+    base = tmp_path_factory.getbasetemp()
+    folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = folder  # for the command line, here or in a process of its own
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -2,6 +2,7 @@
 
 import json
 import math
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -215,12 +216,16 @@ def test_a_peer_that_never_solves_gets_a_bound_in_the_picture() -> None:
     assert bar.ratio.median == 10.0  # 30 s against 3
 
 
-def test_a_peer_that_cannot_be_installed_is_skipped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "ghost.txt").write_text(f"{tmp_path}/nowhere/ghost-1.0.tar.gz\n")
+def test_a_peer_that_cannot_be_installed_is_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    failed = subprocess.CompletedProcess([], 1, stdout="", stderr="collecting\nERROR: no ghost-1.0\n")
+    monkeypatch.setattr(subprocess, "run", lambda *_, **__: failed)
+    (tmp_path / "ghost.txt").write_text("ghost==1.0\n")
     peer = Contestant("ghost", "pendulum", "ghost.py", (), "ghost")
     pythons, absent = bench.installed([peer], tmp_path, tmp_path / "environments")
     assert pythons == {None: Path(sys.executable)}
-    assert "nowhere" in absent["ghost"]
+    assert absent == {"ghost": "ERROR: no ghost-1.0"}
     assert "skipped" in capsys.readouterr().out
     assert not (tmp_path / "environments" / "ghost" / "installed").exists()
 

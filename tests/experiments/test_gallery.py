@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from matplotlib import image
 
-from cross_targets import need
 from experiments.figures import make as figures
 from experiments.figures import runs as figure_runs
 from experiments.figures.captions import CONFIRMED, NOT, Caption
@@ -18,7 +16,6 @@ from experiments.figures.runs import RunSpec
 from experiments.gallery import browser
 from experiments.gallery import make as gallery
 from qrl.runs import files
-from qrl_envs import task, viewer
 
 CAPTIONS = {
     name: Caption(f"Of {name}", "Shows it.", f"claims {name}", [f"- {name} is 3."], "By a rule.", verdict)
@@ -166,20 +163,16 @@ def test_a_file_is_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     )
 
 
-def test_the_viewer_is_screenshoted(tmp_path: Path) -> None:
-    """Its scene, whole: the vehicle's and the tolerance's colours, down to where the scene ends."""
-    need(browser.missing())
-    t = np.arange(101) * 0.01
-    observations, actions = np.zeros((1, 101, 18)), np.zeros((1, 100, 4))
-    observations[..., [0, 4, 8]] = 1.0
-    observations[..., 9] = np.cos(t)
-    flown = viewer.Recording([0], observations, actions)
-    (tmp_path / "view.html").write_text(viewer.page(task.load("hover"), "made up", flown))
-    gallery.screenshot(tmp_path / "view.html", "#start=0&t=0.5", tmp_path / "view.png")
-    pixels = (255 * image.imread(tmp_path / "view.png")[..., :3]).astype(int)
-    assert pixels.shape == (browser.HEIGHT, browser.WIDTH, 3)
-    scene = pixels[200:600, 200:600]
-    assert len(np.unique(scene.reshape(-1, 3), axis=0)) > 100
+def test_the_viewer_is_drawn_before_its_picture_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    driver = SimpleNamespace(get_screenshot_as_png=lambda: f"{len(asked)} calls".encode())
+    monkeypatch.setattr(browser, "missing", list)
+    monkeypatch.setattr(browser, "chromium", lambda _: nullcontext(driver))
+    monkeypatch.setattr(browser, "drawn", lambda _, address: asked.append(address))
+    monkeypatch.setattr(browser, "wait_for", lambda _, promise: asked.append(promise))
+    gallery.screenshot(tmp_path / "view.html", "#start=1", tmp_path / "view.png")
+    assert asked == [f"{(tmp_path / 'view.html').as_uri()}#start=1", browser.NEXT_FRAME]
+    assert (tmp_path / "view.png").read_bytes() == b"2 calls"
 
 
 @pytest.mark.parametrize("missing", [["chromium"], []])
