@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export view sweep tasks figures ablation gallery bench test smoke lint docs torture FORCE
+.PHONY: help setup train evaluate export view sweep tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -14,17 +14,17 @@ define HELP
   make setup                         make .venv with the pinned dependencies
   make tasks                         list the tasks that TASK may name
   make train TASK=circle             train, and leave a run folder
-       SEED=0 SEEDS=1                  the first seed; how many to train side by side
+       SEED=0 SEEDS=1                  the first seed; how many to train in one program
        OUT=runs/circle                 the run folder
-       RESUME=1                        go on where that run stopped
+       RESUME=1                        resume that run from its last checkpoint
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--gamma 0.97"             any other flag of `qrl train`; `qrl train --help` lists them
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
        ARGS=--off-nominal              any flag of `qrl evaluate`; "--beside runs/ppo": other runs too
-  make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, proved bit by bit
+  make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, verified bit for bit
   make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
        ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE
-  make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; the same command goes on
+  make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; rerun to resume
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
   make figures                       the paper's six figures with captions, from runs that it makes and keeps
@@ -40,9 +40,10 @@ define HELP
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright
   make docs                          the pages as a website in site/, links checked
-  make torture                       the long fault and fuzz campaign, and the tests with the newest versions
+  make stress                        the long fault and fuzz campaign, and the tests with the newest versions
 
-TASK is a name or a path to a .json. `make setup PYTHON=python3.12` picks the interpreter.
+TASK is a name, a path to a .json, or module:factory of your environment.
+`make setup PYTHON=python3.12` picks the interpreter.
 endef
 
 help:
@@ -104,8 +105,12 @@ test: $(STAMP)
 smoke: $(STAMP)
 	@exec tests/smoke.sh
 
-torture: $(STAMP)
-	@exec tests/torture.sh
+stress: $(STAMP)
+	@exec tests/stress.sh
+
+torture:
+	@echo 'note: make torture is now make stress' >&2
+	@$(MAKE) stress
 
 # The generator is no dependency of qrl: it is installed when it is asked for.
 docs: $(STAMP)

@@ -15,10 +15,10 @@ from cross_targets import need
 from qrl.export import targets
 from qrl.export.targets import Core
 
-# Chosen by --hypothesis-profile. The default's cases are the same each time; those of the torture are others.
+# Chosen by --hypothesis-profile. The default's cases are the same each time; those of `make stress` are drawn anew.
 # The deadline of a case is for what hangs: the machine may be busy.
 settings.register_profile("default", max_examples=100, deadline=10_000, derandomize=True, database=None)
-settings.register_profile("torture", max_examples=10_000, deadline=10_000, database=None, print_blob=True)
+settings.register_profile("stress", max_examples=10_000, deadline=10_000, database=None, print_blob=True)
 settings.load_profile("default")
 
 

@@ -7,7 +7,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export JAX_PLATFORMS=cpu
-unset QRL_TORTURE MAKEFLAGS MFLAGS MAKELEVEL # the sample, not the campaign
+unset QRL_STRESS MAKEFLAGS MFLAGS MAKELEVEL # the sample, not the campaign
 
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT

@@ -37,7 +37,7 @@ def foreign_tasks() -> list[str]:
 def task_record(name: str) -> TaskRecord:
     """The task of a shipped name, a `.json` path, one of Brax's names, or "module:factory"."""
     if ":" in name and not name.endswith(".json"):
-        _made_by_factory(name)
+        _call_factory(name)
         return TaskRecord(name=name, spec=None)
     if name not in task_spec.shipped() and not name.endswith(".json"):
         if name in foreign_tasks():
@@ -47,18 +47,35 @@ def task_record(name: str) -> TaskRecord:
     return TaskRecord(name=_folder(Path(name).stem, name), spec=spec)
 
 
-def _made_by_factory(name: str) -> Env:
-    """The environment of "module:factory", a function of the user's without arguments; BadInput if there is none."""
+def _call_factory(name: str) -> Env:
+    """The environment that "module:factory" returns; modules in the current folder are found too. BadInput if none."""
     module_name, _, factory_name = name.partition(":")
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
+    stage = f"module '{module_name}' cannot be imported"
     try:
-        env = getattr(importlib.import_module(module_name), factory_name)()
-    except Exception as error:  # the user's code may raise anything
-        raise BadInput(f"task '{name}': cannot be made: {type(error).__name__}: {error}") from None
-    if missing := [a for a in ("reset", "step", "observation_size", "action_size") if not hasattr(env, a)]:
-        raise BadInput(f"task '{name}': expected an environment like Brax's, found one without {', '.join(missing)}")
+        module = importlib.import_module(module_name)
+        if not callable(factory := getattr(module, factory_name, None)):
+            near = specfile.nearest(factory_name, [n for n in dir(module) if not n.startswith("_")])
+            raise BadInput(f"task '{name}': module '{module_name}' has no function '{factory_name}'{near}")
+        stage = f"{factory_name}() failed"
+        env: Any = factory()
+        missing = [a for a in ("reset", "step", "observation_size", "action_size") if not hasattr(env, a)]
+    except BadInput:
+        raise
+    except (Exception, SystemExit) as error:  # the user's code may raise anything
+        raise BadInput(f"task '{name}': {stage}: {type(error).__name__}: {error}") from None
+    if missing:
+        raise BadInput(
+            f"task '{name}': expected an environment with Brax's reset and step, found {type(env).__name__}"
+            f" without {', '.join(missing)}"
+        )
     return env
+
+
+def folder_name(record: TaskRecord) -> str:
+    """Default name of a run folder: the task's, or its factory's."""
+    return record.name if record.spec else record.name.rpartition(":")[2]
 
 
 def task_named(name: str, path: Path) -> TaskRecord:
@@ -79,7 +96,7 @@ def _folder(name: str, where: str) -> str:
 def environment(record: TaskRecord) -> Env:
     """The Brax environment of a recorded task."""
     if ":" in record.name and record.spec is None:
-        return _made_by_factory(record.name)
+        return _call_factory(record.name)
     if record.spec is None:
         return _brax_envs().get_environment(record.name)
     return worlds.from_task(spec(record))
@@ -96,7 +113,7 @@ def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
         spec = task_spec.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
         return TaskRecord(name=_folder(record.name, f"{where}: key 'task.name'"), spec=spec)
     if ":" in record.name:
-        _made_by_factory(record.name)
+        _call_factory(record.name)
     elif record.name not in foreign_tasks():
         raise BadInput(f"{where}: key 'task.name': unknown task '{record.name}'")
     return record

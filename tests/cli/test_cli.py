@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cli_helpers import TINY, complaint, qrl
-from fault_injection import TORTURE
+from fault_injection import STRESS
 from qrl_envs.plots import errors
 
 
@@ -294,7 +294,7 @@ def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
     assert "not a run folder" in complaint(capsys, "evaluate", tmp_path)
 
 
-@pytest.mark.skipif(not TORTURE, reason="part of make torture: Brax's own physics take a minute to compile")
+@pytest.mark.skipif(not STRESS, reason="part of make stress: Brax's own physics take a minute to compile")
 @pytest.mark.usefixtures("quick_compilation")
 def test_foreign_environment_trains(tmp_path: Path) -> None:
     """Our learner on one of Brax's own environments, which measures no success."""

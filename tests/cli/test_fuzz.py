@@ -1,6 +1,6 @@
 """Garbage in: whatever stands in a file that qrl reads, it is read, or refused in one line that names the file.
 
-`--hypothesis-profile=torture` runs 10,000 cases of each kind of file, others each time.
+`--hypothesis-profile=stress` runs 10,000 cases of each kind of file, others each time.
 """
 
 import copy
@@ -111,7 +111,7 @@ def reads_chunk(path: Path) -> None:
 
 
 def reads_held(path: Path) -> None:
-    assert sweep._held(path.parent, GRID)
+    assert sweep._holds_sweep(path.parent, GRID)
 
 
 def reads_metrics(path: Path) -> None:

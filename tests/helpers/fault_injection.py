@@ -22,7 +22,7 @@ import pytest
 from qrl.runs import checkpoint
 from qrl.runs.integrity import MANIFEST
 
-TORTURE = os.environ.get("QRL_TORTURE") == "1"  # all of it, not a sample
+STRESS = os.environ.get("QRL_STRESS") == "1"  # all of it, not a sample
 PATIENCE = 400.0  # seconds: whatever takes longer hangs
 
 # One configuration for all, so that its programs are compiled once.
@@ -271,4 +271,4 @@ def tell(request: pytest.FixtureRequest, line: str) -> None:
     """Through the terminal, whatever pytest captures."""
     capture: Any = request.config.pluginmanager.getplugin("capturemanager")
     with capture.global_and_fixture_disabled() if capture else contextlib.nullcontext():
-        print(f"\ntorture: {line}", flush=True)
+        print(f"\nstress: {line}", flush=True)

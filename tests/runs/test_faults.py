@@ -12,7 +12,7 @@ import pytest
 
 import fault_injection
 from cli_helpers import qrl
-from fault_injection import REPORTS, STEPS, TORTURE, TRAIN, Ended
+from fault_injection import REPORTS, STEPS, STRESS, TRAIN, Ended
 from qrl.runs import checkpoint, files
 from qrl.runs.integrity import MANIFEST
 
@@ -46,11 +46,11 @@ def events(run: Path) -> int:
 
 
 def assert_refused(capfd: pytest.CaptureFixture[str], run: Path, message: str, *words: str) -> None:
-    """A resume ends with exit code 2 and one line, and changes no file. In a process of its own under TORTURE."""
+    """A resume ends with exit code 2 and one line, and changes no file. In a process of its own under STRESS."""
     before = fault_injection.digest(run)
     FAULTS.append(message)
     command = [*(words or TRAIN), "--out", run, "--resume"]
-    if TORTURE:
+    if STRESS:
         ended = fault_injection.qrl(*command)
     else:
         capfd.readouterr()
@@ -61,9 +61,9 @@ def assert_refused(capfd: pytest.CaptureFixture[str], run: Path, message: str, *
 
 
 def assert_resumes(run: Path, complete: Path) -> None:
-    """Resumed, the run ends as one without a fault. In a process of its own under TORTURE."""
+    """Resumed, the run ends as one without a fault. In a process of its own under STRESS."""
     words = [*TRAIN, "--out", run, "--resume"]
-    if TORTURE:
+    if STRESS:
         fault_injection.done(fault_injection.qrl(*words))
     else:
         assert qrl(*words) == 0
@@ -139,7 +139,7 @@ def test_full_disk_at_the_first_checkpoint(tmp_path: Path, complete: Path) -> No
         assert_resumes(disk.seen / "run", complete)
 
 
-@pytest.mark.parametrize("room", ["some", *(["none"] if TORTURE else [])])
+@pytest.mark.parametrize("room", ["some", *(["none"] if STRESS else [])])
 def test_full_disk_after_several_checkpoints(tmp_path: Path, complete: Path, room: str) -> None:
     with fault_injection.small_disk(tmp_path / "disk", "20m") as disk:
         run = fault_injection.unfinished(complete, disk.seen / "run", LATE)
@@ -158,7 +158,7 @@ def test_full_disk_after_several_checkpoints(tmp_path: Path, complete: Path, roo
         assert_resumes(run, complete)
 
 
-@pytest.mark.skipif(not TORTURE, reason="part of make torture")
+@pytest.mark.skipif(not STRESS, reason="part of make stress")
 @pytest.mark.parametrize("name", ["metrics.csv", "summary.json", "learning_curve.png", "flight.png", "tensorboard"])
 def test_file_that_cannot_be_written(stopped: Path, complete: Path, name: str) -> None:
     """A directory is in its place, or a file in place of a directory."""
@@ -175,7 +175,7 @@ def test_file_that_cannot_be_written(stopped: Path, complete: Path, name: str) -
     assert_resumes(stopped, complete)
 
 
-@pytest.mark.parametrize("when", ["before", *(["compiling", "training"] if TORTURE else [])])
+@pytest.mark.parametrize("when", ["before", *(["compiling", "training"] if STRESS else [])])
 def test_folder_that_becomes_read_only(tmp_path: Path, complete: Path, when: str) -> None:
     with fault_injection.small_disk(tmp_path / "disk", "20m") as disk:
         run = fault_injection.unfinished(complete, disk.seen / "run", LATE)
@@ -198,7 +198,7 @@ def test_folder_that_becomes_read_only(tmp_path: Path, complete: Path, when: str
         assert_resumes(run, complete)
 
 
-@pytest.mark.parametrize("how", ["moved", *(["removed"] if TORTURE else [])])
+@pytest.mark.parametrize("how", ["moved", *(["removed"] if STRESS else [])])
 def test_folder_that_vanishes_while_training(tmp_path: Path, complete: Path, how: str) -> None:
     """No run is made in its place. Moved back, the run resumes."""
     run, away = tmp_path / "run", tmp_path / "away"

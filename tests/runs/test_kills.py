@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import fault_injection
-from fault_injection import LONG, LONG_STEPS, STEPS, TORTURE, TRAIN
+from fault_injection import LONG, LONG_STEPS, STEPS, STRESS, TRAIN
 
 SAMPLE = [pytest.param("one", 3, {}, TRAIN, id="3 kills")]
 ALL = [
@@ -18,7 +18,7 @@ ALL = [
 ]
 
 
-@pytest.mark.parametrize(("name", "kills", "variables", "words"), ALL if TORTURE else SAMPLE)
+@pytest.mark.parametrize(("name", "kills", "variables", "words"), ALL if STRESS else SAMPLE)
 def test_killed_run_equals_one_never_stopped(
     request: pytest.FixtureRequest,
     tmp_path: Path,
@@ -35,7 +35,7 @@ def test_killed_run_equals_one_never_stopped(
         whole = tmp_path / "whole"
         fault_injection.done(fault_injection.qrl(*words, "--out", whole, **variables))
     begun = time.monotonic()
-    if TORTURE:  # how long one takes whose programs are compiled
+    if STRESS:  # how long one takes whose programs are compiled
         fault_injection.done(fault_injection.qrl(*words, "--out", tmp_path / "again", **variables))
     seconds = max(time.monotonic() - begun, 8.0)
     seeds = ("seed-0", "seed-1") if "--seeds" in words else (".",)

@@ -180,7 +180,7 @@ WRONG: dict[str, tuple[dict, str]] = {
     "not a number": ({"axes": {"sigma": [float("nan")]}}, r"key 'sigma': expected a finite number"),
     "a fraction of a count": ({"axes": {"num_envs": [8, 8.5]}}, r"at num_envs 8.5: key 'num_envs'"),
     "wrong sense in the task": ({"axes": {"task.rod.mass_kg": [-1.0]}}, r"key 'rod.mass_kg': expected greater than 0"),
-    "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"evaluation_key is the same for all points"),
+    "how it is judged": ({"axes": {"task.evaluation.tail_s": [1.0]}}, r"all points of a grid have the same evaluation"),
     "duplicate values": ({"axes": {"gamma": [0.9, 0.9]}}, r"expected each point once, found gamma 0.9 and gamma 0.9"),
     "duplicate by another way": (
         {"axes": {"num_envs": [16, 16.0]}},

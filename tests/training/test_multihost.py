@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import fault_injection
-from fault_injection import TORTURE
+from fault_injection import STRESS
 from qrl.runs import checkpoint
 from qrl.runs.integrity import FORMAT, MANIFEST
 
@@ -47,14 +47,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.skipif(not TORTURE, reason="part of make torture; those that are killed prove it too")
+@pytest.mark.skipif(not STRESS, reason="part of make stress; those that are killed prove it too")
 def test_two_processes_equal_two_devices(tmp_path: Path, whole: Path) -> None:
     """Bit for bit, clocks aside; the first alone writes."""
     both_done(*TRAIN, "--out", tmp_path / "run")
     fault_injection.assert_same_run(tmp_path / "run", whole)
 
 
-@pytest.mark.parametrize("killed", [1, *([0, 1, 0] if TORTURE else [])])
+@pytest.mark.parametrize("killed", [1, *([0, 1, 0] if STRESS else [])])
 def test_killed_pair_goes_on(request: pytest.FixtureRequest, tmp_path: Path, whole: Path, killed: int) -> None:
     """Killed between two checkpoints: the other ends by itself; started again, both end as if never killed."""
     run = tmp_path / "run"
@@ -71,7 +71,7 @@ def test_killed_pair_goes_on(request: pytest.FixtureRequest, tmp_path: Path, who
     if killed == 1:
         assert ended[0].code == 1
         assert ended[0].error.startswith("qrl: ")
-    if TORTURE:  # the same work on as many devices, in one process
+    if STRESS:  # the same work on as many devices, in one process
         alone = shutil.copytree(run, tmp_path / "alone")
         fault_injection.done(fault_injection.qrl(*TRAIN, "--out", alone, "--resume", **TWO_DEVICES))
         fault_injection.assert_same_run(alone, whole)
@@ -86,7 +86,7 @@ def complete(run: Path) -> int:
     return len(checkpoint.saved_steps(run)) if (run / "checkpoints").is_dir() else 0
 
 
-@pytest.mark.skipif(not TORTURE, reason="part of make torture")
+@pytest.mark.skipif(not STRESS, reason="part of make stress")
 def test_a_refused_checkpoint_leaves_nobody_waiting(tmp_path: Path, whole: Path) -> None:
     """Found when all are at work: the first says why, and both end."""
     run = fault_injection.unfinished(whole, tmp_path / "run", STEPS // 2)

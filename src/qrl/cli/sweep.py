@@ -14,8 +14,7 @@ from qrl import tasks
 from qrl.cli.terminal import DONE, FAILED, clock, console, print_error, progress_bar, stop_requested
 from qrl.runs import files, record
 from qrl.sweep import grid as grids
-from qrl.sweep import plot, results
-from qrl.sweep import runner as members_of
+from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import Grid
 from qrl.sweep.runner import ChunkDone, Compiling, Group, Member
 from qrl.training import devices, multihost
@@ -29,35 +28,35 @@ POLL_SECONDS = 0.5  # between two checks of the other processes' results
 
 
 def sweep(args: argparse.Namespace) -> int:
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     process = multihost.this_process(args.process_id, args.processes, args.coordinator, os.environ)
     given = args.memory_gb * 1e9 if args.memory_gb is not None else None
     grid = grids.load(args.grid, given or devices.host_bytes())  # before waiting for other processes
     multihost.join(process)
     budget = given or devices.memory_bytes()
     out: Path = args.out or Path("runs") / args.grid.stem
-    held = _held(out, grid)
-    if held and (out / "summary.json").exists() and (out / "sweep.png").exists():
+    exists = _holds_sweep(out, grid)
+    if exists and (out / "summary.json").exists() and (out / "sweep.png").exists():
         console.print(f"{out}: complete already; nothing to do")
-        return _ending(out)
+        return _exit_code(out)
     groups = _groups(grid, process, budget, args.grid)
     out.mkdir(parents=True, exist_ok=True)
     busy = f"{out}: in use by another sweep; wait for its end, or give another OUT"
     with files.locked(out / f"process-{process.number}.lock", busy):
-        return _work(args, began, process, budget, grid, groups, out)
+        return _work(args, start_time, process, budget, grid, groups, out)
 
 
 def _work(
     args: argparse.Namespace,
-    began: float,
+    start_time: float,
     process: Process,
     budget: float,
     grid: Grid,
     groups: list[Group],
     out: Path,
 ) -> int:
-    """With the folder locked: train what is left, and write the results."""
-    _prepare(out, grid, process, _held(out, grid))
+    """With the folder locked: train the remaining members, and write the results."""
+    _write_grid(out, grid, process, _holds_sweep(out, grid))
     total = len(grid.points) * len(grid.seeds)
     console.print(
         f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
@@ -65,17 +64,17 @@ def _work(
         f" -> {out}"
     )
     with stop_requested("stopping: finished chunks are kept") as stopped:
-        _follow(groups, out, budget, stopped)
+        _train_groups(groups, out, budget, stopped)
         found = _all_results(out, total, process, stopped)
     if found is None:
         console.print("stopped; rerun the same command to resume")
         return FAILED
     if process.number:
         return DONE  # process 0 writes the results
-    return _finish(out, grid, found, args.grid.stem, time.perf_counter() - began)
+    return _finish(out, grid, found, args.grid.stem, time.perf_counter() - start_time)
 
 
-def _held(out: Path, grid: Grid) -> bool:
+def _holds_sweep(out: Path, grid: Grid) -> bool:
     """Whether `out` holds this sweep already; BadInput if it holds another."""
     if out.exists() and not out.is_dir():
         raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
@@ -91,7 +90,7 @@ def _held(out: Path, grid: Grid) -> bool:
 
 
 def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Group]:
-    """This process's members of every program. Every n-th, whatever is finished: so no two make the same one."""
+    """This process's members of every program: every n-th, so that no two processes train the same one."""
     groups = []
     for indices in grid.groups():
         first = grid.points[indices[0]]
@@ -102,8 +101,8 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
             Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
         ]
         trainer = make_trainer(env, first.learner)
-        each, workers = members_of.member_bytes(trainer, members[0].point), len(devices.workers())
-        if not members_of.chunk_members(len(members), each, budget, workers):
+        each, workers = runner.member_bytes(trainer, members[0].point), len(devices.workers())
+        if not runner.chunk_members(len(members), each, budget, workers):
             raise BadInput(
                 f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
                 f" (such as {grids.describe(first.coordinates)}) of which one for each worker"
@@ -113,69 +112,69 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
     return groups
 
 
-def _prepare(out: Path, grid: Grid, process: Process, held: bool) -> None:
-    if not held and process.number == 0:
+def _write_grid(out: Path, grid: Grid, process: Process, exists: bool) -> None:
+    if not exists and process.number == 0:
         here = {"versions": record.versions(), "devices": devices.device_names()}
         files.write_json(out / "grid.json", {**grid.record, **here})
 
 
-def _follow(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
-    """Train every group with progress on the screen: a line a chunk, and a bar."""
+def _train_groups(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
+    """Train every group with progress on the screen: a line for each chunk, and a bar."""
     work = sum(len(group.members) * group.steps for group in groups)
-    kept = members_of.finished(
+    kept = runner.finished(
         out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are trained again")
     )
     mine = [group.steps for group in groups for member in group.members if member.number in kept]
     done = before = sum(mine)
     count, total = len(mine), sum(len(group.members) for group in groups)
-    began = time.perf_counter()
+    start_time = time.perf_counter()
 
-    def left(now: float) -> str:
-        spent = time.perf_counter() - began
+    def eta(now: float) -> str:
+        spent = time.perf_counter() - start_time
         return clock(spent / (now - before) * (work - now)) if now > before else "–"
 
     with progress_bar(work, done) as update:
         for number, group in enumerate(groups):
             under_way: dict[int, int] = {}
-            for event in members_of.run(group, devices.workers(), budget, out / "chunks", stopped):
+            for event in runner.run(group, devices.workers(), budget, out / "chunks", stopped):
                 if isinstance(event, Compiling):
                     console.print(f"compiling program {number + 1} of {len(groups)}, {event.chunk} members at once")
                 elif isinstance(event, ChunkDone):
                     under_way.pop(event.worker, None)
                     done += len(event.results) * group.steps
                     count += len(event.results)
-                    console.print(_line(event, count, total, left(done + sum(under_way.values()))))
+                    console.print(_line(event, count, total, eta(done + sum(under_way.values()))))
                 else:
                     under_way[event.worker] = event.env_steps
                     now = done + sum(under_way.values())
-                    update(now, f"{count} of {total} members, ETA {left(now)}")
+                    update(now, f"{count} of {total} members, ETA {eta(now)}")
 
 
-def _line(event: ChunkDone, count: int, total: int, left: str) -> str:
+def _line(event: ChunkDone, count: int, total: int, eta: str) -> str:
     num_diverged = sum(bool(result.diverged) for result in event.results.values())
     return (
         f"{count:>6} of {total} members done, {clock(event.seconds)} for the last {len(event.results)},"
-        f" ETA {left}{f'; {num_diverged} diverged' if num_diverged else ''}"
+        f" ETA {eta}{f'; {num_diverged} diverged' if num_diverged else ''}"
     )
 
 
 def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
     """Every member's result, once all processes are done; None if stopped before."""
-    found = members_of.finished(out / "chunks")
+    found = runner.finished(out / "chunks")
     if len(found) < total and process.of > 1 and not stopped():
         console.print(f"process {process.number}: waiting for the other processes")
     while len(found) < total and process.of > 1 and not stopped():
         time.sleep(POLL_SECONDS)
-        found = members_of.finished(out / "chunks")
+        found = runner.finished(out / "chunks")
     return found if len(found) == total else None
 
 
 def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
-    findings = results.summaries(grid, found)
-    results.write(out, grid, found, findings, seconds)
-    _print_table(findings, len(grid.seeds))
-    plot.sweep(out / "sweep.png", findings, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
-    code = _ending(out)
+    summaries = results.summaries(grid, found)
+    results.write(out, grid, found, summaries, seconds)
+    _print_table(summaries, len(grid.seeds))
+    plot.sweep(out / "sweep.png", summaries, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
+    code = _exit_code(out)
     if code == DONE:
         console.print(
             f"done in {clock(seconds)}: {out}/results.csv, summary.json, sweep.png;"
@@ -184,27 +183,27 @@ def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: fl
     return code
 
 
-def _ending(out: Path) -> int:
-    """The exit code of a finished sweep, the first time and every other."""
+def _exit_code(out: Path) -> int:
+    """The exit code of a finished sweep."""
     if (out / "best.json").exists():
         return DONE
-    print_error(f"{out}: every member diverged; results.csv says where")
+    print_error(f"{out}: every member diverged; see results.csv")
     return FAILED
 
 
-def _print_table(findings: list[results.Finding], seeds: int) -> None:
+def _print_table(summaries: list[results.Summary], seeds: int) -> None:
     """The best points, best first: median and quartiles over seeds."""
     rows = [
         [*(_cell(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
         + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
-        for f in results.ranked(findings)[:SHOWN]
+        for f in results.ranked(summaries)[:SHOWN]
     ]
-    rows.insert(0, [*findings[0]["at"], "return", "success", "diverged"])
+    rows.insert(0, [*summaries[0]["at"], "return", "success", "diverged"])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         console.print("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
-    if len(findings) > SHOWN:
-        console.print(f"… and {len(findings) - SHOWN:,} more in summary.json")
+    if len(summaries) > SHOWN:
+        console.print(f"… and {len(summaries) - SHOWN:,} more in summary.json")
 
 
 def _cell(value: Any) -> str:

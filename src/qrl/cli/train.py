@@ -74,7 +74,7 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     if args.preset:
         file = file.model_copy(update={"learner": tasks.preset(args.preset, "--preset") | file.learner})
     config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds)
-    out: Path = args.out or Path("runs") / config.task.name.rpartition(":")[2]
+    out: Path = args.out or Path("runs") / tasks.folder_name(config.task)
     if out.exists() and not out.is_dir():
         raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
     exists = (out / "config.json").exists()

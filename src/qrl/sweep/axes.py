@@ -1,4 +1,4 @@
-"""The axes of a grid: what a name may be, which values it takes, and how they become settings of a run."""
+"""Axes of a grid: their names, their values, and the settings of a run that they change."""
 
 import json
 import math
@@ -15,14 +15,14 @@ from qrl.runs.record import TaskRecord
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput, Count, Real, Spec
 
-DIGITS = 6  # to which the values of a range are rounded: enough to tell them apart, few enough to read
-# What a table of results calls its own columns; and whatever begins so.
+DIGITS = 6  # significant digits of the values of a range
+# Columns of results.csv, and prefixes of others: no axis may have such a name.
 COLUMNS = (
     *("point", "seed", "seeds", "diverged", "env_steps", "updates", "return_mean", "return_min", "success"),
     *("train_seconds", "steps_per_second", "reward_mean", "ended_early", *UpdateMetrics._fields),
 )
 MEASURES = ("settle_", "rms_")
-JUDGED = "task.evaluation"  # the same for all points, else they could not be compared
+EVALUATION = "task.evaluation"  # the same for all points, else they could not be compared
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Axis:
 
 
 class Range(Spec):
-    """Numbers between two, evenly spaced or so in their logarithm; `count` of them, or drawn at random."""
+    """Numbers from an interval: `count` of them, evenly spaced (linear or logarithmic), or drawn at random."""
 
     from_: Real = Field(alias="from")
     to: Real
@@ -56,7 +56,7 @@ class Range(Spec):
     spacing: Literal["lin", "log"] = "lin"
 
     @model_validator(mode="after")
-    def _possible(self) -> "Range":
+    def _check(self) -> "Range":
         if not self.from_ < self.to:
             raise ValueError(f"expected from < to, found {self.from_} and {self.to}")
         if self.spacing == "log" and self.from_ <= 0:
@@ -75,7 +75,7 @@ class Range(Spec):
 
     @property
     def values(self) -> tuple[float, ...]:
-        """Made when asked for: of two thousand million only the number is looked at."""
+        """Computed on access: `size` alone decides whether a grid fits into memory."""
         return tuple(self.at(i / (self.size - 1)) for i in range(self.size))
 
     def at(self, share: float) -> float:
@@ -91,9 +91,9 @@ class Range(Spec):
 
 
 def settable(task: TaskRecord) -> list[str]:
-    """Every setting that a grid may name: hyperparameters, and paths into the task's own record."""
+    """Settings that a grid may name: hyperparameters, and paths into the task's record."""
     paths = [path for path in _paths(task.spec or {}, "task") if path != "task.description"]
-    return [*Config.model_fields, *(path for path in paths if not path.startswith(JUDGED))]
+    return [*Config.model_fields, *(path for path in paths if not path.startswith(EVALUATION))]
 
 
 def _paths(value: Any, path: str) -> Iterable[str]:
@@ -148,7 +148,7 @@ def _check_title(name: str, settings: dict[str, Any], key: str) -> None:
 
 
 def check_conflicts(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:
-    """BadInput if a name is unknown, or set from two sides."""
+    """BadInput if a name is unknown, or set twice."""
     setters = dict.fromkeys(fixed, "fixed")
     for name in fixed:
         _check_known(name, known, f"{where}: fixed")
@@ -161,7 +161,7 @@ def check_conflicts(fixed: dict[str, Any], axes: dict[str, Axis | Range], known:
 
 
 def _check_known(name: str, known: list[str], where: str) -> None:
-    if name.startswith(JUDGED):
-        raise BadInput(f"{where}: key '{name}': how a task is evaluation_key is the same for all points of a grid")
+    if name.startswith(EVALUATION):
+        raise BadInput(f"{where}: key '{name}': all points of a grid have the same evaluation")
     if name not in known:
         raise BadInput(f"{where}: unknown key '{name}'{specfile.nearest(name, known)}")

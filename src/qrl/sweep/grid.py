@@ -1,4 +1,4 @@
-"""A grid file and the points it asks for, each as a run that can start; BadInput if one cannot."""
+"""From a grid file to its points, each a run that can start; BadInput if one cannot."""
 
 import itertools
 import json
@@ -23,7 +23,7 @@ REPORT_BYTES = 3_000  # and for each report of a member: a row of some twenty nu
 
 
 class Sample(Spec):
-    """Random points in the full grid's stead."""
+    """Random points, in place of the full grid."""
 
     count: Count
     seed: CountOrZero = 0
@@ -36,7 +36,7 @@ def _seeds(value: Any) -> Any:
 
 
 class GridFile(Spec):
-    """What a grid file holds. `seeds`: how many, from 0, or which."""
+    """Content of a grid file. `seeds`: their number, counted from 0, or a list."""
 
     task: str
     fixed: dict[str, Any] = Field(default_factory=dict)
@@ -47,7 +47,7 @@ class GridFile(Spec):
 
 @dataclass(frozen=True)
 class GridPoint:
-    """One point: its coordinates on the axes, and the run it stands for."""
+    """One point: its coordinates on the axes, its task and its hyperparameters."""
 
     coordinates: dict[str, Any]  # axis -> value, or the name of an axis's settings
     task: TaskRecord
@@ -63,7 +63,7 @@ class GridPoint:
 
     @property
     def evaluation_key(self) -> dict[str, Any]:
-        """How a report judges this point, as `evaluation()` of its environment and `fly` resolve it."""
+        """All that determines how a report evaluates this point; equal for all points of a grid."""
         flights = {"number of flights (num_eval_envs)": self.learner.num_eval_envs}
         spec = self.task.spec
         if spec is None:
@@ -92,7 +92,7 @@ class Grid:
 
     @property
     def record(self) -> dict[str, Any]:
-        """All that decides the results, for grid.json."""
+        """All that determines the results, for grid.json."""
         points = [
             {"at": p.coordinates, "task": p.task.model_dump(mode="json"), "learner": p.learner.model_dump(mode="json")}
             for p in self.points
@@ -147,7 +147,7 @@ def load(path: Path, budget_bytes: float) -> Grid:
 
 
 def _with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """A grid file's content with hyperparameters under today's names."""
+    """The content of a grid file with hyperparameters under their current names."""
 
     def renamed(value: Any, key: str) -> Any:
         return current_names(value, f"{where}: {key}") if isinstance(value, dict) else value
@@ -161,12 +161,12 @@ def _with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def _in_single(value: Any) -> str:
-    """A JSON value as the program sees it: its numbers in single precision."""
+    """A JSON value with its numbers in single precision, as the program has them."""
     return json.dumps(json.loads(json.dumps(value), parse_float=lambda text: float(np.float32(text))), sort_keys=True)
 
 
 def _check_comparable(first: GridPoint, point: GridPoint, where: str) -> None:
-    """BadInput if two points are not evaluated alike: what they reach could not be compared."""
+    """BadInput if two points are evaluated differently: their results would not be comparable."""
     for name, value in first.evaluation_key.items():
         if point.evaluation_key[name] != value:
             raise BadInput(
@@ -176,7 +176,7 @@ def _check_comparable(first: GridPoint, point: GridPoint, where: str) -> None:
 
 
 def describe(coordinates: dict[str, Any]) -> str:
-    """A point in a line."""
+    """The coordinates as one line."""
     return ", ".join(
         f"{name} {value if isinstance(value, str) else json.dumps(value)}" for name, value in coordinates.items()
     )

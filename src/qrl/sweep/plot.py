@@ -16,15 +16,15 @@ LOG_ABOVE = 20.0  # ratio of the greatest to the least value from which an axis 
 LABELLED = 120  # cells of a heat map that still have room for their numbers
 COLOURS = {"return_mean": BLUE, "success": GREEN}
 NAMES = {"return_mean": "return", "success": "success"}
-Finding = dict[str, Any]  # {"at": {axis: value}, metric: {"median", "q1", "q3"}}
+Summary = dict[str, Any]  # {"at": {axis: value}, metric: {"median", "q1", "q3"}}
 
 
-def sweep(path: Path, found: Sequence[Finding], title: str) -> None:
+def sweep(path: Path, found: Sequence[Summary], title: str) -> None:
     """Draw median return and, where it is measured, success of every point."""
     sweep_figure(found, title).savefig(path, format="png")
 
 
-def sweep_figure(found: Sequence[Finding], title: str) -> Figure:
+def sweep_figure(found: Sequence[Summary], title: str) -> Figure:
     """What `sweep` saves. Axes: a row for each metric."""
     names = list(found[0]["at"])
     metrics = [m for m in COLOURS if any(np.isfinite(f[m]["median"]) for f in found)] or ["return_mean"]
@@ -42,8 +42,8 @@ def sweep_figure(found: Sequence[Finding], title: str) -> Figure:
     return figure
 
 
-def _panel(axes: Axes, found: Sequence[Finding], name: str, metric: str, *, band: bool) -> None:
-    """A point's median against its place on one axis; over a single axis with the quartiles over seeds."""
+def _panel(axes: Axes, found: Sequence[Summary], name: str, metric: str, *, band: bool) -> None:
+    """Median of each point over its coordinate on one axis; for a single axis with the quartiles over seeds."""
     x, colour = _positions(found, name), COLOURS[metric]
     median, low, high = (np.array([f[metric][q] for f in found], float) for q in ("median", "q1", "q3"))
     median, low, high = (np.where(np.isfinite(v), v, np.nan) for v in (median, low, high))
@@ -56,14 +56,14 @@ def _panel(axes: Axes, found: Sequence[Finding], name: str, metric: str, *, band
         axes.errorbar(x, median, np.array([median - low, high - median]), color=colour, fmt="o", capsize=4)
     else:
         axes.plot(x, median, "o", color=colour, alpha=0.5, markersize=4)
-        places = np.unique(x)
-        if len(places) < len(x):
-            middles = [np.nanmedian(m) if np.isfinite(m := median[x == p]).any() else np.nan for p in places]
-            axes.plot(places, middles, color=colour, linewidth=2)
+        unique = np.unique(x)
+        if len(unique) < len(x):
+            middles = [np.nanmedian(m) if np.isfinite(m := median[x == p]).any() else np.nan for p in unique]
+            axes.plot(unique, middles, color=colour, linewidth=2)
     _finish(axes, found, name, metric)
 
 
-def _finish(axes: Axes, found: Sequence[Finding], name: str, metric: str) -> None:
+def _finish(axes: Axes, found: Sequence[Summary], name: str, metric: str) -> None:
     if not _numeric(found, name):
         labels = _labels(found, name)
         axes.set_xticks(range(len(labels)), labels, rotation=20 if len(labels) > 3 else 0, parse_math=False)
@@ -79,14 +79,14 @@ def _finish(axes: Axes, found: Sequence[Finding], name: str, metric: str) -> Non
     axes.set_axisbelow(True)
 
 
-def _heat_map(axes: Axes, found: Sequence[Finding], names: list[str], metric: str) -> None:
+def _heat_map(axes: Axes, found: Sequence[Summary], names: list[str], metric: str) -> None:
     """Medians over both axes; a point without one stays grey."""
     down, across = (_labels(found, name) for name in names)
     cells = np.full((len(down), len(across)), np.nan)
     for f in found:
         value = f[metric]["median"]
-        place = down.index(_label(f["at"][names[0]])), across.index(_label(f["at"][names[1]]))
-        cells[place] = value if np.isfinite(value) else np.nan
+        cell = down.index(_label(f["at"][names[0]])), across.index(_label(f["at"][names[1]]))
+        cells[cell] = value if np.isfinite(value) else np.nan
     axes.set_facecolor("#BBBBBB")
     low, high = (0.0, 1.0) if metric == "success" else (None, None)
     image = axes.imshow(cells, aspect="auto", cmap="viridis", origin="lower", vmin=low, vmax=high)
@@ -102,19 +102,19 @@ def _heat_map(axes: Axes, found: Sequence[Finding], names: list[str], metric: st
             axes.text(j, i, f"{value:.4g}", ha="center", va="center", fontsize=8, color=colour)
 
 
-def _numeric(found: Sequence[Finding], name: str) -> bool:
+def _numeric(found: Sequence[Summary], name: str) -> bool:
     return all(isinstance(v := f["at"][name], int | float) and not isinstance(v, bool) for f in found)
 
 
-def _positions(found: Sequence[Finding], name: str) -> np.ndarray:
-    """Where the points lie on an axis: its numbers, or the places of its values in their order."""
+def _positions(found: Sequence[Summary], name: str) -> np.ndarray:
+    """Positions of the points on an axis: its numbers, or the indices of its values in their order."""
     if _numeric(found, name):
         return np.array([f["at"][name] for f in found], float)
     labels = _labels(found, name)
     return np.array([labels.index(_label(f["at"][name])) for f in found], float)
 
 
-def _labels(found: Sequence[Finding], name: str) -> list[str]:
+def _labels(found: Sequence[Summary], name: str) -> list[str]:
     return list(dict.fromkeys(_label(f["at"][name]) for f in found))
 
 

@@ -1,4 +1,4 @@
-"""What a sweep found: a table, medians and quartiles over seeds, the best point, and a run that repeats it."""
+"""Results of a sweep: tables, medians and quartiles over seeds, the best point, and a run that repeats it."""
 
 import json
 import math
@@ -15,11 +15,13 @@ from qrl.sweep.runner import Result
 from qrl.training import devices
 
 CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
-Finding = dict[str, Any]  # of one point: place, seeds, how many diverged, quartiles of each number of the last report
+Summary = dict[
+    str, Any
+]  # of one point: coordinates, seeds, number diverged, quartiles of each number of the last report
 
 
 def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
-    """A row for each point and seed: the point's place, the seed, and its last report."""
+    """A row for each point and seed: the point's coordinates, the seed, and its last report."""
     return [
         {**_label(grid, index), "diverged": result.diverged, **result.rows[-1]}
         for index, result in sorted(results.items())
@@ -37,16 +39,16 @@ def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
 
 def _label(grid: Grid, index: int) -> dict[str, Any]:
     point, seed = divmod(index, len(grid.seeds))
-    place = {name: _cell(value) for name, value in grid.points[point].coordinates.items()}
-    return {"point": point, **place, "seed": grid.seeds[seed]}
+    coordinates = {name: _cell(value) for name, value in grid.points[point].coordinates.items()}
+    return {"point": point, **coordinates, "seed": grid.seeds[seed]}
 
 
 def _cell(value: Any) -> Any:
     return value if isinstance(value, str | int | float) and not isinstance(value, bool) else json.dumps(value)
 
 
-def summaries(grid: Grid, results: dict[int, Result]) -> list[Finding]:
-    """For each point the quartiles over its seeds; a seed that diverged counts as the worst there could be."""
+def summaries(grid: Grid, results: dict[int, Result]) -> list[Summary]:
+    """For each point the quartiles over its seeds; a seed that diverged counts as the worst possible."""
     measured = any(math.isfinite(row["success"]) for result in results.values() for row in result.rows[-1:])
     found = []
     for i, point in enumerate(grid.points):
@@ -75,29 +77,29 @@ def _quartiles(values: list[float]) -> dict[str, float]:
 
 
 def _quantile(ordered: Any, share: float) -> float:
-    """As NumPy has it, but of infinities too: between an infinity and a number lies that infinity."""
+    """NumPy's linear quantile, defined for infinities too: between an infinity and a number lies that infinity."""
     if np.isfinite(ordered).all() or np.isnan(ordered[-1]):
         return float(np.quantile(ordered, share))
-    place = share * (len(ordered) - 1)
-    low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
-    if low == high:  # one place, or the same infinity
+    position = share * (len(ordered) - 1)
+    low, high = float(ordered[math.floor(position)]), float(ordered[math.ceil(position)])
+    if low == high:  # one element, or the same infinity
         return low
-    fraction = place - math.floor(place)
+    fraction = position - math.floor(position)
     return low * (1 - fraction) + high * fraction
 
 
-def best(found: list[Finding], results: dict[int, Result], seeds: int) -> int | None:
+def best(found: list[Summary], results: dict[int, Result], seeds: int) -> int | None:
     """The point of the highest median success and, among equals, median return; None if all diverged."""
-    alive = [finding for finding in found if finding["diverged"] < seeds]
+    alive = [summary for summary in found if summary["diverged"] < seeds]
     return max(alive, key=_rank)["point"] if alive else None
 
 
-def _rank(finding: Finding) -> tuple[bool, float, float]:
-    alive = finding["diverged"] < finding["seeds"]
-    return alive, rank_key(finding["success"]["median"]), rank_key(finding["return_mean"]["median"])
+def _rank(summary: Summary) -> tuple[bool, float, float]:
+    alive = summary["diverged"] < summary["seeds"]
+    return alive, rank_key(summary["success"]["median"]), rank_key(summary["return_mean"]["median"])
 
 
-def ranked(found: list[Finding]) -> list[Finding]:
+def ranked(found: list[Summary]) -> list[Summary]:
     """Best first."""
     return sorted(found, key=_rank, reverse=True)
 
@@ -117,7 +119,7 @@ def best_run_config(grid: Grid, results: dict[int, Result], point: int) -> RunCo
     )
 
 
-def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Finding], seconds: float) -> None:
+def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Summary], seconds: float) -> None:
     """results.csv, curves.csv, best.json and, last, summary.json."""
     files.replace_text(out / "results.csv", files.csv_text(table(grid, results)))
     files.replace_text(out / "curves.csv", files.csv_text(curves(grid, results)))

@@ -1,7 +1,7 @@
-"""Many members through one compiled program: in chunks that fit into memory, each recorded whole once it is done.
+"""Train many members with one compiled program, in chunks that fit into memory; each chunk is recorded once complete.
 
-A finished chunk is a file in the sweep's folder, written under another name and then renamed; whoever goes on with an
-interrupted sweep, on however many devices or hosts, makes only the members that no file holds.
+A finished chunk is a file in the sweep's folder, written atomically. An interrupted sweep resumes, on any number of
+devices or hosts, with the members that no file holds.
 """
 
 import json
@@ -26,14 +26,14 @@ from qrl.training import driver
 from qrl.training.state import MemberInputs, stack
 from qrl.training.trainer import Trainer
 
-# A CPU takes the members of a chunk one after the other: more gain no speed, and are what an interruption loses.
+# A CPU trains the members of a chunk in sequence: larger chunks are no faster, and an interruption loses more of them.
 CPU_CHUNK = 8
 
 
 class Member(NamedTuple):
     """One point with one seed."""
 
-    number: int  # in the whole sweep: point · seeds + seed's place
+    number: int  # in the sweep: index of the point · number of seeds + index of the seed
     seed: int
     point: MemberInputs
 
@@ -53,15 +53,15 @@ class Group:
 
 
 class Result(NamedTuple):
-    """What is kept of a member."""
+    """The recorded result of a member."""
 
     rows: list[Row]  # as in metrics.csv; `train_seconds` is its share of the chunk's
-    diverged: str  # what was first not finite, and when; "": nothing
+    diverged: str  # what was not finite first, and when; "" if all was finite
 
 
 @dataclass(frozen=True)
 class Compiling:
-    """About to compile a group's programs for so many members at once."""
+    """The programs of a group are compiled now, for `chunk` members at once."""
 
     group: Group
     chunk: int
@@ -69,11 +69,11 @@ class Compiling:
 
 @dataclass(frozen=True)
 class Progress:
-    """A sign of life: a worker's chunk has come this far."""
+    """Heartbeat: progress of a worker's chunk."""
 
     group: Group
     worker: int
-    env_steps: int  # of all its members
+    env_steps: int  # of all members of the chunk
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class ChunkDone:
 
 
 def member_bytes(trainer: Trainer, point: MemberInputs) -> int:
-    """What a member needs: its state, once more where the program writes it, and its flights."""
+    """Bytes of device memory of a member: its state twice (input and output of the program), and its flights."""
     seeds, points = _abstract_inputs([Member(0, 0, point)], 1, None)
     states = jax.eval_shape(trainer.init, seeds, points)
     flights = jax.eval_shape(trainer.fly, states.learner, points, driver.report_starts(trainer.config))
@@ -99,7 +99,7 @@ def _bytes(tree: Any) -> int:
 
 
 def chunk_members(members: int, each_bytes: int, budget_bytes: float, workers: int) -> int:
-    """Members of one chunk, so that every worker has one in memory, and chunks are even; 0: not even one fits.
+    """Members of one chunk, so that each worker holds one chunk and chunks are of even size; 0: not even one fits.
 
     A program needs room for its members and, as scratch, for about one more.
     """
@@ -117,17 +117,17 @@ def run(
 ) -> Iterator[Compiling | Progress | ChunkDone]:
     """Train the members of a group that have no result yet, a worker for each of `devices`, until `stopped()`.
 
-    A device may be named several times: a CPU runs a program on about one core, and takes several at a time.
+    A device may occur several times: a CPU runs a program on about one core, and can run several at a time.
     """
     done = finished(folder)
-    left = [member for member in group.members if member.number not in done]
-    if not left or stopped():
+    remaining = [member for member in group.members if member.number not in done]
+    if not remaining or stopped():
         return
-    size = chunk_members(len(left), member_bytes(group.trainer, left[0].point), budget_bytes, len(devices))
+    size = chunk_members(len(remaining), member_bytes(group.trainer, remaining[0].point), budget_bytes, len(devices))
     folder.mkdir(parents=True, exist_ok=True)
     yield Compiling(group, size)
-    programs = {device: _compiled(group.trainer, left, size, device) for device in set(devices)}
-    chunks = deque(left[i : i + size] for i in range(0, len(left), size))
+    programs = {device: _compiled(group.trainer, remaining, size, device) for device in set(devices)}
+    chunks = deque(remaining[i : i + size] for i in range(0, len(remaining), size))
     events: Queue[Any] = Queue()
     halt = threading.Event()
 
@@ -157,12 +157,12 @@ def run(
                 yield event
     finally:
         halt.set()
-        for thread in threads:  # to the end of its lap: Python must not end while it is inside XLA
+        for thread in threads:  # until its chunk of steps ends: Python must not exit while a thread is inside XLA
             thread.join()
 
 
 def _next(chunks: deque[list[Member]]) -> list[Member]:
-    """A chunk for whoever asks first; none left: empty."""
+    """The next chunk; empty if none is left."""
     with suppress(IndexError):
         return chunks.popleft()
     return []
@@ -178,16 +178,16 @@ def _abstract_inputs(members: list[Member], size: int, device: Any) -> tuple[Any
 
 
 def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, driver.Programs]:
-    """The first state's program and the others, for chunks of `size` members."""
+    """The program of the initial states, and those of training, for chunks of `size` members."""
     seeds, points = _abstract_inputs(members, size, device)
     states = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
         jax.eval_shape(trainer.init, seeds, points),
     )
-    advance, climb, fly = (
+    train, apg, fly = (
         compiled(trainer, states, points) for compiled in (driver.compile_train, driver.compile_apg, driver.compile_fly)
     )
-    return trainer.init.lower(seeds, points).compile(), driver.Programs(advance, lambda: climb, fly, trainer.gather)
+    return trainer.init.lower(seeds, points).compile(), driver.Programs(train, lambda: apg, fly, trainer.gather)
 
 
 def _chunk(
@@ -199,17 +199,17 @@ def _chunk(
     folder: Path,
     halted: Callable[[], bool],
 ) -> Iterator[Callable[[int], Progress | ChunkDone]]:
-    """Train a chunk and record it, unless `halted()` on the way; yields events that lack their worker."""
+    """Train a chunk and record it, unless `halted()`; yields functions worker -> event."""
     began = time.perf_counter()
-    padded = members + [members[-1]] * (size - len(members))  # one program, one number of members
+    padded = members + [members[-1]] * (size - len(members))  # the program is compiled for `size` members
     points = jax.device_put(stack([member.point for member in padded]), device)
     seeds = jax.device_put(np.asarray([member.seed for member in padded], np.int32), device)
     states = programs[0](seeds, points)
     rows: list[list[Row]] = [[] for _ in members]
     faults: list[str] = []
-    for lap in driver.run_chunks(states, points, programs[1], group.trainer.config, driver.Clock(), halted):
-        faults, env_steps = lap.faults, lap.env_steps * len(members)
-        for kept, row in zip(rows, lap.rows, strict=False):  # what fills the chunk up is not kept
+    for update in driver.run_chunks(states, points, programs[1], group.trainer.config, driver.Clock(), halted):
+        faults, env_steps = update.faults, update.env_steps * len(members)
+        for kept, row in zip(rows, update.rows, strict=False):  # without the padding
             share = {"train_seconds": round(row["train_seconds"] / len(members), 3)}
             kept.append({key: value for key, value in (row | share).items() if key != "steps_per_second"})
         yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
@@ -221,7 +221,7 @@ def _chunk(
 
 
 def record(results: dict[int, Result]) -> dict[str, Any]:
-    """What a chunk's file holds. Numbers that are not finite as text: JSON has none."""
+    """The content of a chunk's file. Numbers that are not finite are text: JSON has none."""
     members = {
         str(i): {
             "rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows],
@@ -229,16 +229,16 @@ def record(results: dict[int, Result]) -> dict[str, Any]:
         }
         for i, (rows, why) in results.items()
     }
-    return {"members": members, "crc32": _sum(members)}
+    return {"members": members, "crc32": _checksum(members)}
 
 
-def _sum(members: Any) -> int:
-    """By which a damaged chunk is known, whatever the damage."""
+def _checksum(members: Any) -> int:
+    """Detects a damaged chunk."""
     return zlib.crc32(json.dumps(members).encode())
 
 
 def finished(folder: Path, unreadable: Callable[[Path], None] = lambda path: None) -> dict[int, Result]:
-    """The results in a sweep's folder of chunks, by member. What cannot be read is as if it had not been made."""
+    """The results in a sweep's folder of chunks, by member; files that cannot be read are ignored."""
     results = {}
     for path in sorted(folder.glob("*.json")):
         try:
@@ -250,7 +250,7 @@ def finished(folder: Path, unreadable: Callable[[Path], None] = lambda path: Non
 
 def _recorded(path: Path) -> dict[int, Result]:
     data = json.loads(path.read_text(encoding="utf-8"))
-    if data["crc32"] != _sum(data["members"]):
+    if data["crc32"] != _checksum(data["members"]):
         raise ValueError("damaged")
     found = {}
     for index, kept in data["members"].items():

@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# The long campaign: every fault, every fuzz case, and the tests with the newest versions: `make torture`.
+# The long campaign: every fault, every fuzz case, and the tests with the newest versions: `make stress`.
 #
 # Each file gives its own summary, and a failure stops nothing; the last line says what ran and what broke.
-# A test says how many faults it injected in a line such as "torture: 24 kills". Usage: tests/torture.sh
+# A test says how many faults it injected in a line such as "stress: 24 kills". Usage: tests/stress.sh
 set -uo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
-export JAX_PLATFORMS=cpu QRL_TORTURE=1
+export JAX_PLATFORMS=cpu QRL_STRESS=1
 unset MAKEFLAGS MFLAGS MAKELEVEL
 
 files=(tests/{runs/test_kills,training/test_multihost,runs/test_checkpoint,runs/test_faults,cli/test_fuzz,cli/test_cli}.py)
@@ -18,7 +18,7 @@ trap 'exit 1' INT TERM
 for file in "${files[@]}"; do
   echo "== $file"
   code=0
-  .venv/bin/python -m pytest "$file" --hypothesis-profile=torture \
+  .venv/bin/python -m pytest "$file" --hypothesis-profile=stress \
     -o junit_family=xunit1 --junitxml="$work/$(basename "$file" .py).xml" 2>&1 | tee -a "$work/said" || code=$?
   echo "$file $code" >>"$work/codes"
 done
@@ -54,12 +54,12 @@ for file, code in codes:
                 found.append(f"{file}::{test.get('name')}" if test.get("classname") else f"{file}, as it was collected")
         skipped += [test.get("name") for test in suite.iter("testcase") if test.find("skipped") is not None]
     broke += found or ([f"{file} (pytest's exit code {code})"] if code != "0" else [])
-faults = sum(int(n) for n in re.findall(r"^torture: (\d+) (?:faults|kills?)\b", (work / "said").read_text(), re.MULTILINE))
+faults = sum(int(n) for n in re.findall(r"^stress: (\d+) (?:faults|kills?)\b", (work / "said").read_text(), re.MULTILINE))
 trials = re.findall(r"^newest: (.*?): (held|broke):", (work / "newest").read_text(), re.MULTILINE)
 broke += [f"the newest versions on {python}" for python, held in trials if held != "held"]
 broke += [f"no {what} ran" for what, n in (("fault", faults), ("fuzz case", cases), ("version trial", len(trials))) if not n]
 print(
-    f"torture: {faults:,} faults, {cases:,} fuzz cases and {len(trials)} version trials in {seconds} s; "
+    f"stress: {faults:,} faults, {cases:,} fuzz cases and {len(trials)} version trials in {seconds} s; "
     + (f"{len(skipped)} skipped ({', '.join(skipped)}); " if skipped else "")
     + (f"broke: {', '.join(broke)}" if broke else "nothing broke")
 )
