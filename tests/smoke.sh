@@ -160,7 +160,7 @@ bad_input() {
   refuses "make view without RUN" "RUN is missing" make view
   refuses "to view a run that is not there" "nowhere" "$qrl" view "$out/nowhere"
   refuses "a misspelt task" "'hover'" "$qrl" train hoverr --out "$out/no"
-  refuses "a misspelt flag" "--stepz.*--num-timesteps" "$qrl" train hover --num-timestepz 10 --out "$out/no"
+  refuses "a misspelt flag" "--num-timestepz.*--num-timesteps" "$qrl" train hover --num-timestepz 10 --out "$out/no"
   refuses "a flag's value" "steps.*many|many.*steps" "$qrl" train hover --num-timesteps many --out "$out/no"
   refuses "a run that is not there" "nowhere" "$qrl" evaluate "$out/nowhere"
   refuses "to export a run that is not there" "nowhere" "$qrl" export "$out/nowhere"

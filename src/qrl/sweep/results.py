@@ -15,9 +15,8 @@ from qrl.sweep.runner import Result
 from qrl.training import devices
 
 CURVE = ("env_steps", "updates", "return_mean", "return_min", "success")
-Summary = dict[
-    str, Any
-]  # of one point: coordinates, seeds, number diverged, quartiles of each number of the last report
+# Of one point: coordinates, seeds, number diverged, quartiles of each number of the last report.
+Summary = dict[str, Any]
 
 
 def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:

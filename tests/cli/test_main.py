@@ -1,0 +1,82 @@
+"""The command line before JAX is loaded, and environments of the user's own."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from qrl import tasks
+from qrl.cli.main import _parse, limit_size
+from qrl.config import FORMER_NAMES, Config
+from qrl.request import config_file
+from qrl_envs.specfile import BadInput
+
+
+@pytest.mark.parametrize(("former", "name"), FORMER_NAMES.items())
+def test_a_former_flag_sets_what_it_is_called_now(former: str, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """And says so; the flag of today says nothing."""
+    assert name in Config.model_fields
+    flags = [f"--{each.replace('_', '-')}" for each in (former, name)]
+    given = [vars(_parse(["train", "hover", flag, "7"]))[f"learner.{name}"] for flag in flags]
+    assert given == ["7", "7"]
+    assert capsys.readouterr().out == f"note: {flags[0]} is now {flags[1]}\n"
+
+
+def test_former_names_in_a_file_are_those_of_today(tmp_path: Path) -> None:
+    path = tmp_path / "config.json"
+    path.write_text('{"learner": {"lanes": 8, "gamma": 0.9}}')
+    assert config_file(path).learner == {"num_envs": 8, "gamma": 0.9}
+    path.write_text('{"learner": {"lanes": 8, "num_envs": 8}}')
+    with pytest.raises(BadInput, match=r"config\.json: learner: key 'lanes': is called 'num_envs' now"):
+        config_file(path)
+
+
+def test_help_gives_type_and_default_of_each_hyperparameter(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        _parse(["train", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "--num-envs INT environments stepped in parallel (lanes) (default 64)" in text
+    assert "--form ratio|difference" in text
+    assert "--observation-scale [FLOAT,…]" in text
+    assert "--lanes" not in text
+
+
+def test_the_compile_cache_keeps_the_newest(tmp_path: Path) -> None:
+    for age in range(4):
+        file = tmp_path / str(age)
+        file.write_bytes(b"x" * 10)
+        os.utime(file, (1000 - age, 1000 - age))
+    limit_size(tmp_path, 25)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["0", "1"]
+    limit_size(tmp_path / "nowhere", 25)
+
+
+MODULE = """
+from brax.envs.fast import Fast
+
+def make():
+    return Fast()
+
+def number():
+    return 3
+
+def fails():
+    raise RuntimeError("no licence")
+"""
+
+
+def test_a_task_is_a_function_of_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_worlds.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    record = tasks.task_record("my_worlds:make")
+    assert (record.name, record.spec, tasks.folder_name(record)) == ("my_worlds:make", None, "make")
+    assert tasks.environment(record).action_size == 1
+    for name, why in {
+        "my_worlds:fails": "no licence",
+        "my_worlds:number": "found int without reset, step",
+        "my_worlds:mak": "did you mean 'make'",
+        "my_world:make": "No module named 'my_world'",
+    }.items():
+        with pytest.raises(BadInput, match=f"task '{name}': .*{why}"):
+            tasks.task_record(name)
