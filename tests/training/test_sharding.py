@@ -31,7 +31,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Values]:
 
 def of_training(values: Values) -> Values:
     """Without what only says when starts were drawn, which a lane's neighbours decide."""
-    idle = (".lanes.used", ".lanes.fresh", ".lanes.start")
+    idle = (".lanes.next_state_used", ".lanes.next_state", ".lanes.reset_count")
     return {name: x for name, x in values.items() if not any(part in name for part in idle)}
 
 
