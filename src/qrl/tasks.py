@@ -113,7 +113,10 @@ def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
         spec = task_spec.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
         return TaskRecord(name=_folder(record.name, f"{where}: key 'task.name'"), spec=spec)
     if ":" in record.name:
-        _call_factory(record.name)
+        try:
+            _call_factory(record.name)
+        except BadInput as error:
+            raise BadInput(f"{where}: key 'task.name': {error}") from None
     elif record.name not in foreign_tasks():
         raise BadInput(f"{where}: key 'task.name': unknown task '{record.name}'")
     return record
