@@ -17,9 +17,11 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 
 
 def anchors(page: Path) -> set[str]:
-    """GitHub's and mkdocs' anchors of a page's headings."""
-    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+    """GitHub's and mkdocs' anchors of a page's headings, and those that it sets itself."""
+    text = page.read_text(encoding="utf-8")
+    headings = re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE)
+    slugs = {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+    return slugs | set(re.findall(r'<a id="([^"]+)"></a>', text))
 
 
 def fenced(page: Path, language: str) -> list[str]:
@@ -89,6 +91,14 @@ def test_json_is_json(page: Path) -> None:
         json.loads(block)
 
 
+def test_make_docs_checks_links() -> None:
+    """mkdocs in strict mode fails on a warning only where warnings are shown."""
+    recipe = re.search(r"^docs:.*\n((?:\t.*\n)+)", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
+    assert recipe
+    assert not re.search(r"mkdocs build.*(--quiet|-q\b)", recipe[1])
+    assert "\nstrict: true\n" in (ROOT / "mkdocs.yml").read_text()
+
+
 def test_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
 
@@ -123,3 +133,12 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), "first_flight.ipynb", "exec"), namespace)
     assert (tmp_path / "runs" / "notebook" / "export" / "qrl_policy.c").exists()
+
+
+def test_the_readme_snippet_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All python blocks of README, in order, in this process; the programs are those of the notebook."""
+    monkeypatch.chdir(tmp_path)
+    namespace: dict[str, object] = {}
+    for block in fenced(ROOT / "README.md", "python"):
+        exec(compile(block, "README.md", "exec"), namespace)
+    assert (tmp_path / "runs" / "first" / "export" / "manifest.json").exists()
