@@ -104,7 +104,7 @@ def test_checkpoint_of_a_former_format_is_refused(capfd: pytest.CaptureFixture[s
 def test_second_process_on_a_folder_is_refused(capfd: pytest.CaptureFixture[str], stopped: Path) -> None:
     """Until the first releases the lock."""
     with files.locked(stopped / "lock", "busy"):
-        assert_refused(capfd, stopped, f"{stopped}: another process is at work in it")
+        assert_refused(capfd, stopped, f"{stopped}: in use by another process")
     with files.locked(stopped / "lock", "busy"):
         pass
 

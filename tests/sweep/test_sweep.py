@@ -255,7 +255,7 @@ def test_a_chunk_that_cannot_be_read_is_made_anew(
     (out / "chunks" / "0000003.json").write_text(text)
     capsys.readouterr()
     assert qrl("sweep", write_grid(tmp_path, AXES), "--out", out) == 0
-    assert " ".join(capsys.readouterr().out.split()).count("cannot be read; its members are made anew") == 1
+    assert " ".join(capsys.readouterr().out.split()).count("cannot be read; its members are trained again") == 1
     assert rows_of(out / "results.csv") == rows_of(done / "results.csv")
 
 
@@ -263,7 +263,7 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path, capsys: pytest.Cap
     grid, out = write_grid(tmp_path, {"gamma": [0.9]}), tmp_path / "out"
     out.mkdir()
     with files.locked(out / "process-0.lock", ""):
-        assert "another sweep is at work in" in complaint(capsys, "sweep", grid, "--out", out)
+        assert "in use by another sweep" in complaint(capsys, "sweep", grid, "--out", out)
     assert not (out / "grid.json").exists()
 
 
