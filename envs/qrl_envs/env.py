@@ -3,8 +3,9 @@
 `state.pipeline_state` is a `Lane`: the lane's own task (physics, reward weights, start ranges, bounds) travels
 with its physical state, so a batch may mix vehicles. Beyond Brax's `Env`, a `TaskEnv` has `restart` (a new start
 that keeps the lane's task), `with_params`, `reset_calibration`, `symmetry` and `evaluation`. An episode that leaves
-the bounds ends with `done = 1`, and `truncated = 1` and `out_of_bounds = 1` in `info`: it is a truncation, but a value
-function has seen no state beyond the bounds, so a learner should not bootstrap from its value there.
+the bounds ends with `done = 1`, and `truncated = 1` and `out_of_bounds = 1` in `info`: it is a truncation whose last
+reward goes on, for no flight within the bounds is to be worse than leaving them. A value function has seen no state
+beyond the bounds, so a learner should not bootstrap from its value there.
 """
 
 import abc
@@ -117,7 +118,8 @@ class TaskEnv(abc.ABC):
         """One control period under `action` [A], clipped to [−1, 1]."""
         lane: Lane = state.pipeline_state
         x, reward = self._advance(lane.params, lane.x, action)
-        done = self._out_of_bounds(lane.params, x).astype(jnp.float32)
+        out = self._out_of_bounds(lane.params, x)
+        reward, done = jnp.where(out, self._reward_out_of_bounds(lane.params), reward), out.astype(jnp.float32)
         return state.replace(
             pipeline_state=Lane(x, lane.params),
             obs=self._observe(x),
@@ -149,6 +151,11 @@ class TaskEnv(abc.ABC):
     def _out_of_bounds(self, params: Params, x: Any) -> chex.Array:
         """Whether the episode ends early in state `x`; bool []."""
         return jnp.bool_(False)
+
+    def _reward_out_of_bounds(self, params: Params) -> chex.Array:
+        """The reward of a step that leaves the bounds, and of each that the episode would still have had; []."""
+        del params
+        return jnp.float32(0.0)
 
     @abc.abstractmethod
     def evaluation(self) -> Evaluation:
@@ -189,6 +196,17 @@ class QuadrotorEnv(TaskEnv):
         position_ok = jnp.linalg.norm(x.pose.position_m) <= params.bounds["distance_m"]
         rate_ok = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
         return ~(position_ok & rate_ok)  # negated, so that a NaN ends the episode too
+
+    def _reward_out_of_bounds(self, params: Params) -> chex.Array:
+        """The reward at rest under full action, upside down and as far above the origin as the bounds reach.
+
+        The same whichever bound was left. If an end paid the reward of the state in which it came, tumbling at once,
+        near the origin, would cost a tenth of any flight that a policy can make before it has learned to fly.
+        """
+        above = jnp.zeros(3).at[2].set(params.bounds["distance_m"])
+        upside_down = jnp.array([0.0, 1.0, 0.0, 0.0])
+        at_rest = quadrotor.Twist(jnp.zeros(3), jnp.zeros(3))
+        return params.reward(quadrotor.Body(quadrotor.Pose(above, upside_down), at_rest), jnp.ones(self.action_size))
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         draw = symmetry.circle if self.task.reward.form == "circle" else symmetry.hover

@@ -10,6 +10,11 @@ from qrl_envs.quadrotor import Body
 from qrl_envs.task import CircleReward, HoverReward, PendulumReward
 
 
+def _norm(x: chex.Array) -> chex.Array:
+    """Euclidean norm [], with gradient 0 at 0, where that of jnp.linalg.norm is not a number."""
+    return jnp.sqrt(jnp.maximum(jnp.sum(x * x), 1e-30))
+
+
 class Hover(NamedTuple):
     """Weights of the hover reward; scalars."""
 
@@ -27,9 +32,7 @@ class Hover(NamedTuple):
         q_e = jnp.concatenate([1.0 - jnp.abs(q[:1]), q[1:]])
         p_e = body.pose.position_m
         return self.constant - (
-            self.w1_attitude * jnp.linalg.norm(q_e)
-            + self.w2_position_1_m * jnp.linalg.norm(p_e)
-            + self.w3_action * jnp.linalg.norm(action)
+            self.w1_attitude * _norm(q_e) + self.w2_position_1_m * _norm(p_e) + self.w3_action * _norm(action)
         )
 
 
@@ -50,10 +53,10 @@ class Circle(NamedTuple):
         """
         x, y, z = body.pose.position_m
         vx, vy, _ = body.twist.velocity_m_s
-        d = jnp.hypot(jnp.hypot(x, y) - self.radius_m, z)
+        d = _norm(jnp.stack([_norm(body.pose.position_m[:2]) - self.radius_m, z]))
         chi = x * vy - y * vx - self.radius_m * self.speed_m_s
         return self.constant - (
-            self.w4_distance_1_m * d + self.w5_direction_s_m2 * jnp.abs(chi) + self.w6_action * jnp.linalg.norm(action)
+            self.w4_distance_1_m * d + self.w5_direction_s_m2 * jnp.abs(chi) + self.w6_action * _norm(action)
         )
 
 

@@ -104,8 +104,8 @@ class Config(BaseModel):
     )
 
     apg_fraction: Static[Fraction] = Field(
-        description="last fraction of num_timesteps spent on the analytic policy gradient (APG); 0: the paper's method"
-        " alone"
+        description="last fraction of num_timesteps spent on the analytic policy gradient (APG), less where the policy"
+        " does not fly when it is to begin; 0: the paper's method alone"
     )
     apg_num_envs: Static[Count] = Field(description="flights of one APG update")
     apg_episode_length: Static[Count] = Field(description="steps of one APG flight")
@@ -198,6 +198,17 @@ class Config(BaseModel):
         """`unrolls`, rounded up to the end of an APG update where it lies within one."""
         into = max(0, unrolls - self.learning_unrolls)
         return unrolls + -into % self.unrolls_per_apg_update if into else unrolls
+
+    def planned_updates(self, learning_unrolls: int) -> int:
+        """Minibatch updates of a learning phase of that many unrolls."""
+        return max(1, (learning_unrolls - self.warmup_unrolls + 1) * self.updates_per_unroll)
+
+    def extended_learning(self, learning_unrolls: int) -> int:
+        """Unrolls of the learning phase of a policy that does not fly at its end: twice as many, while a quarter of the
+        APG updates would be left.
+        """
+        most = self.num_unrolls - max(1, self.num_apg_updates // 4) * self.unrolls_per_apg_update
+        return max(learning_unrolls, min(most, self.align_to_apg_update(2 * learning_unrolls)))
 
     @property
     def unrolls_per_eval(self) -> int:

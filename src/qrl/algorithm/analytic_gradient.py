@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from qrl.algorithm import learner
 from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
-from qrl.algorithm.types import Env, State
+from qrl.algorithm.types import Env, State, info_flag
 from qrl.config import Hyperparameters
 
 Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [..., A]
@@ -21,8 +21,9 @@ Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [.
 def returns(env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: int) -> tuple[chex.Array, chex.Array]:
     """For each of `keys` [n] a flight of `steps` from a fresh start: sum of its rewards, and whether it is complete.
 
-    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not complete; its sum is 0,
-    without a gradient: where rewards are below 0, ending would pay.
+    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not complete. It is held where
+    it ended, since what overflows has no gradient, and is charged for the steps that are left: the last reward each, or
+    0 if that was above 0 and the flight was not out of bounds. So ending never pays.
     """
 
     def one(key: chex.PRNGKey) -> tuple[State, chex.Array]:
@@ -32,21 +33,26 @@ def returns(env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: 
     def step(carry: tuple[State, chex.Array], noise: chex.Array) -> tuple[tuple[State, chex.Array], chex.Array]:
         state, alive = carry
         after = jax.vmap(env.step)(state, jnp.clip(mean(state.obs) + sigma * noise, -1.0, 1.0))
-        return (after, alive * (1.0 - after.done)), after.reward
+        charge = jnp.where(info_flag(state, "out_of_bounds"), state.reward, jnp.minimum(state.reward, 0.0))
+        reward = jnp.where(alive > 0, after.reward, charge)
+        held = jax.tree.map(
+            lambda new, old: jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)) > 0, new, old), after, state
+        )
+        return (held, alive * (1.0 - after.done)), reward
 
     states, noise = jax.vmap(one)(keys)
     # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.
     first = states, jnp.ones_like(states.reward)
     (_, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, jnp.swapaxes(noise, 0, 1))
-    return jnp.where(alive > 0, jnp.sum(rewards, axis=0), 0.0), alive > 0
+    return jnp.sum(rewards, axis=0), alive > 0
 
 
-def decay(spec: LearnerSpec, step: chex.Array) -> chex.Array:
-    """Factor on step size and noise of APG update `step`, from 1 to 0.
+def decay(step: chex.Array, updates: chex.Array) -> chex.Array:
+    """Factor on step size and noise of APG update `step` of `updates`, from 1 to 0; int32 [] both.
 
     (1 − progress)^1.5: with a linear decay policies still wandered by 2 mm near the end (docs/profile.md).
     """
-    return (1.0 - step / max(1, spec.config.num_apg_updates)) ** 1.5
+    return (1.0 - step / jnp.maximum(1, updates)) ** 1.5
 
 
 def update(
@@ -55,12 +61,14 @@ def update(
     state: LearnerState,
     returns_of: Callable[[LearnerState], tuple[chex.Array, chex.Array]],
     step: chex.Array,
-) -> tuple[LearnerState, UpdateMetrics, chex.Array]:
-    """One step up the mean return; also the sums of returns and of complete flights, over all devices [2].
+    updates: chex.Array,
+) -> tuple[LearnerState, UpdateMetrics, chex.Array, chex.Array]:
+    """One step up the mean return; also the sums of returns and of complete flights over all devices [2], and whether
+    the step was skipped (bool []).
 
-    `returns_of` gives returns [n], differentiable in the policy, and whether each flight is complete [n]. `step`: int32
-    [], the number of this update. The first starts from the deployed policy with a new optimizer. Flights can be
-    chaotic: where the gradient is not finite, policy and optimizer stay.
+    `returns_of` gives returns [n], differentiable in the policy, and whether each flight is complete [n]. `step` is the
+    number of this update, of `updates`: int32 []. The first starts from the deployed policy with a new optimizer.
+    Flights can be chaotic: where the gradient is not finite, the step is skipped: policy and optimizer stay.
     """
     before = learner.deployed(spec, state).params.policy
     optimizer = jax.tree.map(lambda x: jnp.where(step == 0, 0, x).astype(x.dtype), state.optimizer.policy)
@@ -70,7 +78,7 @@ def update(
         return -jnp.mean(values), jnp.stack([jnp.mean(values), jnp.mean(complete)])
 
     gradient, means = learner.mean_over_devices(spec, jax.grad(loss, has_aux=True)(before))
-    rate = decay(spec, step) * hyper.apg_learning_rate
+    rate = decay(step, updates) * hyper.apg_learning_rate
     after, optimizer_after, norm = learner.apply_gradient(hyper, before, gradient, optimizer, rate)
     finite = jnp.isfinite(norm)
     policy, optimizer = jax.tree.map(
@@ -85,4 +93,4 @@ def update(
     zero = jnp.zeros(())
     metrics = UpdateMetrics(*[zero] * len(UpdateMetrics._fields))
     metrics = metrics._replace(policy_loss=-means[0], policy_gradient=jnp.where(finite, norm, 0.0))
-    return state, metrics, spec.config.apg_num_envs * means
+    return state, metrics, spec.config.apg_num_envs * means, ~finite

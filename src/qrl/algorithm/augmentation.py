@@ -12,7 +12,7 @@ from qrl.algorithm.types import TaskEnv, Transition
 
 def sample(keys: chex.PRNGKey, minibatches: int, each: int) -> chex.Array:
     """Uniform numbers that draw a symmetry for each trajectory; [minibatches, S·each, 2] for `keys` [S]."""
-    draws = jax.vmap(lambda key: jax.random.uniform(jax.random.fold_in(key, 1), (minibatches, each, 2)))(keys)
+    draws = jax.vmap(lambda key: jax.random.uniform(key, (minibatches, each, 2)))(keys)
     return jnp.swapaxes(draws, 0, 1).reshape(minibatches, -1, 2)
 
 

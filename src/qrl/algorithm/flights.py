@@ -9,13 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from qrl.algorithm.adapter import adapt
-from qrl.algorithm.types import Env, State
+from qrl.algorithm.types import Env, State, info_flag
 
 
 class Flights(NamedTuple):
     """Leading axis: starts."""
 
-    returns: chex.Array  # [n] sum of the first `return_steps` rewards, up to the episode's end
+    returns: chex.Array  # [n] sum of the first `return_steps` rewards, up to a termination
+    complete: chex.Array  # [n] bool: no end before the last step
     measures: dict[str, chex.Array]  # name -> [n]; empty where the environment measures nothing
     observations: chex.Array  # [n, steps + 1, F]; NaN from where an episode ended early
     actions: chex.Array  # [n, steps, A] clipped to [−1, 1]
@@ -33,25 +34,28 @@ def fly(
     An environment with an `evaluation` is flown and measured as that says, another for one episode of
     `max_episode_steps`. `reset` draws the starts. The policy sees `info["sensor_obs"]`, if present; the
     measures see the true observation. A flight that ends early has no more observations: its NaNs make it a failure.
+    Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better for it.
     """
     plan = adapt(env).evaluation()
     measure = plan.measure if plan else None
     env, steps, return_steps = (plan.env, plan.steps, plan.return_steps) if plan else (env, *[max_episode_steps] * 2)
 
-    def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
+    def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, ...]]:
         state, total = carry
         action = jnp.clip(mean(state.info.get("sensor_obs", state.obs)), -1.0, 1.0)
         after = jax.vmap(env.step)(state, action)
         over = state.done.astype(bool)
-        total = total + jnp.where(over | (t >= return_steps), 0.0, after.reward)
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
-        return (held, total), (_observed(state), action)
+        terminated = over & ~info_flag(state, "out_of_bounds")
+        total = total + jnp.where(terminated | (t >= return_steps), 0.0, held.reward)
+        return (held, total), (_observed(state), action, over)
 
     state = reset(env, keys)
-    (state, returns), (observations, actions) = jax.lax.scan(step, (state, jnp.zeros(keys.shape[0])), jnp.arange(steps))
+    first = state, jnp.zeros(keys.shape[0])
+    (state, returns), (observations, actions, over) = jax.lax.scan(step, first, jnp.arange(steps))
     observations = jnp.concatenate([observations, _observed(state)[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
-    return Flights(returns, measures, observations, actions.swapaxes(0, 1))
+    return Flights(returns, ~over[-1], measures, observations, actions.swapaxes(0, 1))
 
 
 def _observed(state: State) -> chex.Array:

@@ -21,7 +21,7 @@ from qrl.algorithm.types import Networks, Transition
 from qrl.algorithm.vtrace import vtrace
 from qrl.config import Config, Hyperparameters
 
-MIN_ONE_MINUS_GAMMA = 1e-3  # of the absorbing value out of bounds
+MIN_ONE_MINUS_GAMMA = 1e-3  # least 1 − gamma of a reward that is paid forever
 MAX_NORMALIZED = 10.0  # standard deviations at which a standardized observation is clipped
 
 
@@ -42,19 +42,15 @@ class LearnerSpec(NamedTuple):
     def critic(self) -> MLP:
         return MLP(self.config.critic_hidden_layer_sizes, 1, self.config.activation, final_gain=1.0)
 
-    @property
-    def total_updates(self) -> int:
-        """Minibatch updates of the run."""
-        config = self.config
-        return max(1, (config.learning_unrolls - config.warmup_unrolls + 1) * config.updates_per_unroll)
-
 
 class LearnerState(NamedTuple):
     params: Networks
     optimizer: Networks  # each network's own Adam
     average: chex.ArrayTree  # averaged policy parameters
     statistics: RunningStatistics  # of observations, where they are normalized
+    reward_range: chex.Array  # [2] least and greatest reward seen; 0 is within
     updates: chex.Array  # int32 []
+    planned_updates: chex.Array  # int32 []: minibatch updates over which the schedules run
 
 
 class UpdateMetrics(NamedTuple):
@@ -78,19 +74,21 @@ def init(spec: LearnerSpec, hyper: Hyperparameters, key: chex.PRNGKey) -> Learne
         optimizer=Networks(*(_optimizer(hyper).init(ravel_pytree(network)[0]) for network in params)),
         average=params.policy,
         statistics=running_statistics.init(spec.observation_size),
+        reward_range=jnp.zeros(2),
         updates=jnp.int32(0),
+        planned_updates=jnp.int32(spec.config.planned_updates(spec.config.learning_unrolls)),
     )
 
 
-def progress(spec: LearnerSpec, state: LearnerState) -> chex.Array:
-    """Fraction of the run's minibatch updates that are done; 1 during APG."""
-    return jnp.minimum(state.updates / spec.total_updates, 1.0)
+def progress(state: LearnerState) -> chex.Array:
+    """Fraction of the planned minibatch updates that are done; 1 during APG."""
+    return jnp.minimum(state.updates / state.planned_updates, 1.0)
 
 
-def sigma(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState) -> chex.Array:
+def sigma(hyper: Hyperparameters, state: LearnerState) -> chex.Array:
     """Standard deviation of the policy, log-linear in the run's progress; []."""
     start, end = jnp.log(hyper.sigma), jnp.log(hyper.sigma_end)
-    return jnp.exp(start + (end - start) * progress(spec, state))
+    return jnp.exp(start + (end - start) * progress(state))
 
 
 def preprocess(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, observation: chex.Array) -> chex.Array:
@@ -115,8 +113,15 @@ def deployed(spec: LearnerSpec, state: LearnerState) -> LearnerState:
     return state._replace(params=state.params._replace(policy=policy))
 
 
-def update_statistics(spec: LearnerSpec, state: LearnerState, observation: chex.Array) -> LearnerState:
-    """Merge observations [..., F] into the running statistics, where they are used."""
+def update_statistics(
+    spec: LearnerSpec, state: LearnerState, observation: chex.Array, reward: chex.Array
+) -> LearnerState:
+    """Merge rewards [...] into their range, and observations [..., F] into the running statistics, if in use."""
+    extremes = jnp.stack([jnp.min(reward), -jnp.max(reward)])
+    if spec.axis is not None:
+        extremes = jax.lax.pmin(extremes, spec.axis)
+    low, high = state.reward_range
+    state = state._replace(reward_range=jnp.stack([jnp.minimum(low, extremes[0]), jnp.maximum(high, -extremes[1])]))
     if not spec.config.normalize_observations:
         return state
     batch = observation.reshape(-1, spec.observation_size)
@@ -137,7 +142,7 @@ def update(
         gradient = gradient._replace(policy=jax.tree.map(lambda x: x / divisor, gradient.policy))
         metrics = metrics._replace(policy_loss=metrics.policy_loss / divisor)
     metrics = metrics._replace(a_trace=jnp.sqrt(metrics.a_trace))
-    rate = hyper.learning_rate + progress(spec, state) * (hyper.learning_rate_end - hyper.learning_rate)
+    rate = hyper.learning_rate + progress(state) * (hyper.learning_rate_end - hyper.learning_rate)
 
     policy, policy_opt, policy_norm = apply_gradient(
         hyper, state.params.policy, gradient.policy, state.optimizer.policy, rate
@@ -183,12 +188,15 @@ def _loss(
     observation = preprocess(spec, hyper, state, _flat(batch.observation))
     value = networks.apply(spec.critic, params.critic, observation).reshape(samples)
     mean = networks.apply(spec.policy, params.policy, observation)
-    log_pi = log_density(_flat(batch.action), mean, sigma(spec, hyper, state)).reshape(samples)
+    log_pi = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples)
     log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
 
     reward = hyper.reward_scaling * batch.reward
     next_value = _bootstrap_values(spec, hyper, state, params.critic, value, reward, batch)
-    a_trace, v_trace = _targets(spec, hyper, reward, value, next_value, log_rho, batch)
+    # No policy's value is beyond what the extreme rewards pay forever: with this bound V cannot run away.
+    low, high = hyper.reward_scaling * state.reward_range * _horizon(hyper)
+    value_bounded, next_value = (jnp.clip(x, low, high) for x in (value, next_value))
+    a_trace, v_trace = _targets(spec, hyper, reward, value_bounded, next_value, log_rho, batch)
     square = jnp.mean(a_trace**2)
     if _normalizes_in_loss(spec, hyper):
         square = mean_over_devices(spec, square)
@@ -225,7 +233,7 @@ def _bootstrap_values(
     """V of each step's next observation, constant; [B, T].
 
     No transition begins out of bounds, so V is never fitted there and extrapolates; bootstrapped from, it diverges. In
-    its place stands the absorbing value: the last reward forever.
+    its place stands the last reward forever.
     """
     frozen = jax.lax.stop_gradient(critic)
 
@@ -234,8 +242,12 @@ def _bootstrap_values(
         return networks.apply(spec.critic, frozen, inputs).reshape(observation.shape[:-1])
 
     next_value = _next_values(value_of, value, batch)
-    absorbing_value = reward / jnp.maximum(1.0 - hyper.gamma, MIN_ONE_MINUS_GAMMA)
-    return jnp.where(batch.out_of_bounds > 0, absorbing_value, next_value)
+    return jnp.where(batch.out_of_bounds > 0, reward * _horizon(hyper), next_value)
+
+
+def _horizon(hyper: Hyperparameters) -> chex.Array:
+    """Steps 1/(1 − gamma) that a reward paid forever counts for; at most 1 / MIN_ONE_MINUS_GAMMA; []."""
+    return 1.0 / jnp.maximum(1.0 - hyper.gamma, MIN_ONE_MINUS_GAMMA)
 
 
 def _targets(
@@ -292,7 +304,8 @@ def _rms(square: chex.Array) -> chex.Array:
 
 def _averaged_updates(spec: LearnerSpec, state: LearnerState) -> chex.Array:
     """Updates since averaging began; ≤ 0 before."""
-    return state.updates - round(spec.total_updates * (1.0 - spec.config.average_fraction))
+    first = jnp.round(state.planned_updates * (1.0 - spec.config.average_fraction))
+    return state.updates - first.astype(jnp.int32)
 
 
 def _update_average(spec: LearnerSpec, state: LearnerState) -> LearnerState:

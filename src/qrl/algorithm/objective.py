@@ -6,6 +6,7 @@ Each function is written for samples of any one shape; nothing here knows of tim
 from typing import Literal
 
 import chex
+import jax
 import jax.numpy as jnp
 
 Form = Literal["ratio", "difference"]
@@ -26,7 +27,10 @@ def dominance(log_pi: chex.Array, log_mu: chex.Array, advantage: chex.Array, for
     """
     chex.assert_equal_shape((log_pi, log_mu, advantage))
     if form == "ratio":
-        return jnp.expm1(jnp.minimum(log_pi - log_mu, MAX_LOG_RATIO)) * advantage
+        log_ratio = log_pi - log_mu
+        # The clamp passes the gradient on: the samples that pi makes far too likely are those that must teach.
+        clamped = jnp.minimum(log_ratio, MAX_LOG_RATIO) + (log_ratio - jax.lax.stop_gradient(log_ratio))
+        return jnp.expm1(clamped) * advantage
     return (jnp.exp(log_pi) - jnp.exp(log_mu)) * advantage
 
 

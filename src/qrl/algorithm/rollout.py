@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from qrl.algorithm.networks import log_density
-from qrl.algorithm.types import State, TaskEnv, Transition
+from qrl.algorithm.types import State, TaskEnv, Transition, info_flag
 
 BLOCK_LANES = 512  # most lanes stepped at a time on a CPU: with more, what passes between steps leaves its cache
 
@@ -44,7 +44,7 @@ def init(
     none = jnp.zeros(lane_id.shape, bool)
     count = jnp.zeros(lane_id.shape, jnp.int32)
     state = jax.vmap(env.reset)(_start_keys(key, lane_id, count))
-    steps = lane_id * max_episode_steps // num_lanes // unroll_length * unroll_length
+    steps = lane_id * (max_episode_steps // unroll_length) // num_lanes * unroll_length
     return Lanes(lane_id, state, steps.astype(jnp.int32), none, state, count, ~none, count)
 
 
@@ -140,8 +140,3 @@ def _in_blocks(unroll_block: Callable[[Lanes], tuple[Lanes, Transition]], lanes:
         return unroll_block(lanes)
     blocks = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), lanes)
     return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), jax.lax.map(unroll_block, blocks))
-
-
-def info_flag(state: State, name: str) -> chex.Array:
-    """`state.info[name]`, false where it is absent; bool [N]."""
-    return jnp.asarray(state.info.get(name, jnp.zeros_like(state.done))).astype(bool)

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple, Protocol
 
 import chex
+import jax.numpy as jnp
 
 
 class State(Protocol):
@@ -23,12 +24,17 @@ class State(Protocol):
     def replace(self, **changes: Any) -> Any: ...
 
 
+def info_flag(state: State, name: str) -> chex.Array:
+    """`state.info[name]`, false where it is absent; bool of `state.done`'s shape."""
+    return jnp.asarray(state.info.get(name, jnp.zeros_like(state.done))).astype(bool)
+
+
 class Env(Protocol):
     """`brax.envs.Env`, or any class with its methods, with flat observations. (Brax itself takes seconds to import.)
 
     An action is in [−1, 1]ⁿ. `done` is 1 at the end of an episode: a termination, or a truncation where `info` says so
     by "truncation" (Brax's name) or "truncated". `info["out_of_bounds"]` marks a truncation at states from which no
-    transition begins.
+    transition begins; its last reward counts for each step that the episode would still have had.
     """
 
     def reset(self, rng: chex.PRNGKey) -> State: ...

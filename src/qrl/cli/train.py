@@ -129,6 +129,9 @@ def run(plan: Plan, stopped: Callable[[], bool]) -> loop.Finished | None:
                 case loop.Progress():
                     note = f"{event.steps_per_second:,.0f} steps/s, ETA {clock(event.seconds_left)}"
                     update(event.env_steps, note)
+                case loop.LearningExtended():
+                    for seed, steps in event.until.items():
+                        console.print(f"seed {seed} does not fly yet: it learns on, to step {steps:,} before APG")
                 case loop.Reported():
                     update(int(event.rows[0]["env_steps"]), "")
                     console.print(_report(event.rows, event.seconds_left))

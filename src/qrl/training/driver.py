@@ -19,6 +19,7 @@ from qrl.training.trainer import Trainer
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # target duration of one call of a compiled program
+FLIES = 0.9  # share of a report's flights within the bounds from which APG may begin
 
 
 class NotFinite(RuntimeError):
@@ -42,6 +43,7 @@ class Chunk:
     seconds_left: float
     clock: Clock
     rows: list[Row]  # one for each member where a report is due, else none
+    extended: dict[int, int]  # member that does not fly yet -> environment steps at which APG begins now
     faults: list[str]  # of each member: what was first not finite, and when; "": nothing
 
 
@@ -100,12 +102,14 @@ def run_chunks(
     while done < config.num_unrolls and not all_gather(stopped()).any():
         due = (done // config.unrolls_per_eval + 1) * config.unrolls_per_eval
         report_at = config.align_to_apg_update(min(config.num_unrolls, due))
-        learning = done < config.learning_unrolls
-        end = config.learning_unrolls if learning else config.num_unrolls
-        until = min(report_at, end, config.align_to_apg_update(done + size))
-        program = programs.train if learning else programs.apg()
+        handover = programs.gather(states.learning_unrolls)
+        next_handover = min(handover[handover > done], default=config.num_unrolls)
+        until = min(report_at, int(next_handover), config.align_to_apg_update(done + size))
+        phases = [programs.train] if (handover > done).any() else []
+        phases += [programs.apg()] if (handover <= done).any() else []
         chunk_start = time.perf_counter()
-        states = jax.block_until_ready(program(states, inputs, np.int32(until)))
+        for program in phases:
+            states = jax.block_until_ready(program(states, inputs, np.int32(until)))
         seconds = float(all_gather(time.perf_counter() - chunk_start)[multihost.COORDINATOR])
         clock = Clock(clock.train_seconds + seconds, clock.report_seconds + seconds)
         size = max(1, round((until - done) * CHUNK_SECONDS / seconds))
@@ -115,13 +119,33 @@ def run_chunks(
         seconds_left = (time.perf_counter() - start_time) * ahead / made
         faults = _faults(programs.gather((states.fault_update, states.fault_term)))
         rows: list[Row] = []
-        if done == report_at:
+        extended: dict[int, int] = {}
+        handing_over = (handover == done) & (done < config.num_unrolls)
+        if done == report_at or handing_over.any():
             flights = programs.gather(programs.fly(states.learner, inputs, starts))
+            flies = flights.complete.mean(axis=1) >= FLIES
+            longer = np.where(handing_over & ~flies, config.extended_learning(done), handover)
+            extended = {int(i): longer[i] * config.steps_per_unroll for i in np.flatnonzero(longer > handover)}
+            if extended:
+                states = _with_learning_unrolls(states, config, longer)
+        if done == report_at:
             updates, totals = programs.gather((states.learner.updates, states.totals))
             rows = _rows(done * config.steps_per_unroll, updates, totals, flights, clock)
             clock = clock._replace(report_seconds=0.0)
             states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
-        yield Chunk(states, done * config.steps_per_unroll, speed, seconds_left, clock, rows, faults)
+        yield Chunk(states, done * config.steps_per_unroll, speed, seconds_left, clock, rows, extended, faults)
+
+
+def _with_learning_unrolls(states: TrainState, config: Config, unrolls: np.ndarray) -> TrainState:
+    """States whose learning phase ends after `unrolls` [M], with the schedules of a phase of that length."""
+    planned = np.array([config.planned_updates(int(n)) for n in unrolls], np.int32)
+    now = states.learner
+    # Added to zeros of the state, for these are placed as the programs expect it.
+    planned_updates = jnp.zeros_like(now.planned_updates) + planned
+    return states._replace(
+        learning_unrolls=jnp.zeros_like(states.learning_unrolls) + unrolls.astype(np.int32),
+        learner=now._replace(planned_updates=planned_updates),
+    )
 
 
 def _faults(found: tuple[np.ndarray, np.ndarray]) -> list[str]:
@@ -145,6 +169,7 @@ def _rows(env_steps: int, updates: np.ndarray, totals: Totals, flights: Flights,
                 **summary,
                 "reward_mean": float(totals.rewards[i] / max(float(totals.steps[i]), 1.0)),
                 "ended_early": float(totals.early[i] / max(float(totals.episodes[i]), 1.0)),
+                "apg_skipped": float(totals.skipped[i]),
                 **{name: float(value[i]) / count for name, value in totals.metrics._asdict().items()},
                 "steps_per_second": round(float(totals.steps.sum()) / clock.report_seconds, 1),
             }

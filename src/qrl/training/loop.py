@@ -52,6 +52,13 @@ class Progress:
 
 
 @dataclass(frozen=True)
+class LearningExtended:
+    """At the planned end of learning these members do not fly yet: seed -> environment steps at which APG begins."""
+
+    until: dict[int, int]
+
+
+@dataclass(frozen=True)
 class Reported:
     """A report is recorded, and its checkpoint is being saved."""
 
@@ -67,7 +74,7 @@ class Finished:
     rows: list[list[Row]]  # of each seed
 
 
-Event = Resumed | Compiling | Compiled | Progress | Reported | Finished
+Event = Resumed | Compiling | Compiled | Progress | LearningExtended | Reported | Finished
 
 
 class Member:
@@ -131,6 +138,8 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
         for chunk in driver.run_chunks(states, inputs, programs, run.learner, clock, stopped, multihost.all_gather):
             states, begin = chunk.states, chunk.env_steps
             yield recorder.handle(chunk)
+            if chunk.extended:
+                yield LearningExtended({run.seed + i: steps for i, steps in chunk.extended.items()})
         recorder.finish()
         if begin == run.learner.num_unrolls * run.learner.steps_per_unroll:
             flights = programs.gather(programs.fly(states.learner, inputs, driver.report_starts(run.learner)))

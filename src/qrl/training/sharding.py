@@ -96,21 +96,26 @@ def map_members(one: Callable[[Any], Any], members: Any) -> Any:
 
 
 def map_states(
-    one: Callable[[TrainState, Any, chex.Array], TrainState], states: TrainState, inputs: Any, until: chex.Array
+    one: Callable[[TrainState, Any, chex.Array], TrainState],
+    states: TrainState,
+    inputs: Any,
+    until: chex.Array,
+    active: chex.Array,
 ) -> TrainState:
-    """`one(state, inputs, until)` of each member's state."""
+    """`one(state, inputs, until)` of the state of each member that is `active` [M]; the others stay."""
     if sequential_members(len(states.unrolls)):
-        return map_members(lambda m: one(m[0], m[1], until), (states, inputs))
-    # All members are equally far, and their counters have no member axis: batched, they would turn every insert into
-    # the replay buffer into a scatter, and the loop into a selection over the whole state.
+        untils = jnp.where(active, until, states.unrolls)
+        return map_members(lambda m: one(*m), (states, inputs, untils))
+    # The active members are equally far, and their counters have no member axis: batched, they would turn every insert
+    # into the replay buffer into a scatter, and the loop into a selection over the whole state.
     axes: Any = TrainState(*[0] * len(TrainState._fields))._replace(buffer=ReplayBuffer(0, None), unrolls=None)  # pyright: ignore[reportArgumentType]
-    members = states._replace(
-        unrolls=states.unrolls[0], buffer=states.buffer._replace(inserted=states.buffer.inserted[0])
-    )
+    unrolls = jnp.where(jnp.any(active), jnp.max(states.unrolls, initial=0, where=active), until)
+    inserted = jnp.max(states.buffer.inserted, initial=0, where=active)
+    members = states._replace(unrolls=unrolls, buffer=states.buffer._replace(inserted=inserted))
     after = jax.vmap(one, in_axes=(axes, 0, None), out_axes=axes)(members, inputs, until)
-    count = states.unrolls.shape
-    buffer = after.buffer._replace(inserted=jnp.broadcast_to(after.buffer.inserted, count))
-    return after._replace(unrolls=jnp.broadcast_to(after.unrolls, count), buffer=buffer)
+    buffer = after.buffer._replace(inserted=jnp.broadcast_to(after.buffer.inserted, active.shape))
+    after = after._replace(unrolls=jnp.broadcast_to(after.unrolls, active.shape), buffer=buffer)
+    return jax.tree.map(lambda x, y: jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y), after, states)
 
 
 def sequential_members(count: int) -> bool:

@@ -25,6 +25,7 @@ class Totals(NamedTuple):
     episodes: chex.Array  # that ended
     early: chex.Array  # of these, before their last step
     updates: chex.Array
+    skipped: chex.Array  # APG updates whose gradient was not finite
     metrics: UpdateMetrics
 
 
@@ -37,6 +38,8 @@ class TrainState(NamedTuple):
     key: chex.PRNGKey  # of noise and minibatches
     start_key: chex.PRNGKey  # of the lanes' starts
     unrolls: chex.Array  # int32 []
+    learning_unrolls: chex.Array  # int32 []: of these, before APG begins
+    skipped_in_a_row: chex.Array  # int32 []: APG updates
     fault_update: chex.Array  # int32 []: the update in which a number was first not finite; −1: none
     fault_term: chex.Array  # int32 []: its index in FAULT_TERMS
     totals: Totals  # since the last report, which resets them

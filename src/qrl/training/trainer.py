@@ -25,6 +25,8 @@ from qrl.training import sharding
 from qrl.training.sharding import LAYOUT, MEMBER, SHARD
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
 
+MAX_SKIPPED_IN_A_ROW = 20  # APG updates whose gradient is not finite, after which a run stops
+
 
 class Setup(NamedTuple):
     """What shapes the programs of a run."""
@@ -58,8 +60,20 @@ def init_state(setup: Setup, seed: chex.Array, inputs: MemberInputs) -> TrainSta
     _, transitions = jax.eval_shape(lambda *x: collect(setup, hyper, *x), first, lanes, key, start_key)
     buffer = replay_buffer.create(transitions, config.replay_unrolls)
     zero = jnp.float32(0.0)
-    totals = Totals(zero, zero, zero, zero, zero, UpdateMetrics(*[zero] * len(UpdateMetrics._fields)))
-    state = TrainState(first, buffer, lanes, key, start_key, jnp.int32(0), jnp.int32(-1), jnp.int32(-1), totals)
+    totals = Totals(*[zero] * 6, UpdateMetrics(*[zero] * len(UpdateMetrics._fields)))
+    state = TrainState(
+        learner=first,
+        buffer=buffer,
+        lanes=lanes,
+        key=key,
+        start_key=start_key,
+        unrolls=jnp.int32(0),
+        learning_unrolls=jnp.int32(config.learning_unrolls),
+        skipped_in_a_row=jnp.int32(0),
+        fault_update=jnp.int32(-1),
+        fault_term=jnp.int32(-1),
+        totals=totals,
+    )
     # Explicit types, not weak ones: a restored state has no others, and would need a program of its own.
     return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
 
@@ -77,7 +91,7 @@ def collect(
         setup.env,  # of any parameters: each lane carries its own
         lanes,
         lambda observation: learner.policy_mean(spec, hyper, state, observation),
-        learner.sigma(spec, hyper, state),
+        learner.sigma(hyper, state),
         noise_key,
         start_key,
         unroll_length=setup.config.unroll_length,
@@ -89,7 +103,7 @@ def train_step(setup: Setup, inputs: MemberInputs, state: TrainState) -> TrainSt
     """One unroll of all lanes into the replay buffer, and the updates that follow it (Algorithm 2)."""
     noise_key, sample_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
     lanes, transitions = collect(setup, inputs.hyper, state.learner, state.lanes, noise_key, state.start_key)
-    observed = learner.update_statistics(setup.spec, state.learner, transitions.observation)
+    observed = learner.update_statistics(setup.spec, state.learner, transitions.observation, transitions.reward)
     buffer = replay_buffer.add(state.buffer, transitions)
     learned, metrics = jax.lax.cond(
         state.unrolls + 1 >= setup.config.warmup_unrolls,
@@ -106,6 +120,7 @@ def train_step(setup: Setup, inputs: MemberInputs, state: TrainState) -> TrainSt
         episodes=sums[1],
         early=sums[2],
         updates=(learned.updates - observed.updates).astype(jnp.float32),
+        skipped=jnp.float32(0.0),
         metrics=UpdateMetrics(*jnp.sum(metrics, axis=0)),
     )
     return state._replace(
@@ -134,10 +149,10 @@ def _updates(
         return now, jnp.stack(metrics)
 
     shard_ids = sharding.local_indices(setup.mesh, config.shard_count)
-    keys = jax.vmap(lambda shard: jax.random.fold_in(key, shard))(shard_ids)
+    keys = jax.vmap(lambda shard: jax.random.split(jax.random.fold_in(key, shard)))(shard_ids)
     each = config.batch_size // config.shard_count
-    index = replay_buffer.sample(buffer, keys, config.updates_per_unroll, each)
-    return jax.lax.scan(one, state, (index, augmentation.sample(keys, config.updates_per_unroll, each)))
+    index = replay_buffer.sample(buffer, keys[:, 0], config.updates_per_unroll, each)
+    return jax.lax.scan(one, state, (index, augmentation.sample(keys[:, 1], config.updates_per_unroll, each)))
 
 
 def _sums(setup: Setup, transitions: Transition, early: chex.Array) -> chex.Array:
@@ -165,29 +180,37 @@ def _first_fault(collected: chex.Array, metrics: chex.Array, updates: chex.Array
 def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainState) -> TrainState:
     """APG update number `step` (int32 []); the counter of unrolls is left to the caller."""
     config, spec, env = setup.config, setup.spec, setup.env_of(inputs)
-    key = jax.random.fold_in(state.key, config.learning_unrolls + step)
+    key = jax.random.fold_in(state.key, state.learning_unrolls + step)
+    updates = (config.num_unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
     lanes = sharding.local_indices(setup.mesh, config.apg_num_envs)
     keys = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(lanes)
 
     def returns_of(now: LearnerState) -> tuple[chex.Array, chex.Array]:
-        noise = learner.sigma(spec, inputs.hyper, now) * analytic_gradient.decay(spec, step)
+        noise = learner.sigma(inputs.hyper, now) * analytic_gradient.decay(step, updates)
         mean = lambda observation: learner.policy_mean(spec, inputs.hyper, now, observation)  # noqa: E731
         return analytic_gradient.returns(env, mean, noise, keys, config.apg_episode_length)
 
-    now, metrics, (rewards, complete) = analytic_gradient.update(spec, inputs.hyper, state.learner, returns_of, step)
+    now, metrics, (rewards, complete), skipped = analytic_gradient.update(
+        spec, inputs.hyper, state.learner, returns_of, step, updates
+    )
     added = Totals(
         rewards=rewards,
-        steps=complete * config.apg_episode_length,
+        steps=jnp.float32(config.apg_num_envs * config.apg_episode_length),
         episodes=jnp.float32(config.apg_num_envs),
         early=config.apg_num_envs - complete,
         updates=jnp.float32(1.0),
+        skipped=skipped.astype(jnp.float32),
         metrics=metrics,
     )
-    fault = ~jnp.isfinite(metrics.policy_loss) & (state.fault_update < 0)
+    in_a_row = jnp.where(skipped, state.skipped_in_a_row + 1, 0)
+    bad_reward = ~jnp.isfinite(metrics.policy_loss)
+    fault = (bad_reward | (in_a_row >= MAX_SKIPPED_IN_A_ROW)) & (state.fault_update < 0)
+    term = jnp.where(bad_reward, FAULT_TERMS.index("reward"), FAULT_TERMS.index("policy_gradient"))
     return state._replace(
         learner=now,
+        skipped_in_a_row=in_a_row,
         fault_update=jnp.where(fault, state.learner.updates, state.fault_update),
-        fault_term=jnp.where(fault, FAULT_TERMS.index("reward"), state.fault_term),
+        fault_term=jnp.where(fault, term, state.fault_term),
         totals=jax.tree.map(jnp.add, state.totals, added),
     )
 
@@ -206,9 +229,11 @@ class Trainer(NamedTuple):
     """The jitted programs of a run, over M members; `train` and `apg` donate the states.
 
     init   (seeds [M], inputs [M])         -> states [M]
-    train  (states [M], inputs [M], until) -> states [M] after `until` unrolls, at most config.learning_unrolls
-    apg    (states [M], inputs [M], until) -> states [M] after `until` unrolls, from there on
+    train  (states [M], inputs [M], until) -> states [M] after `until` unrolls; members in their APG phase stay
+    apg    (states [M], inputs [M], until) -> states [M] after `until` unrolls; members still learning stay
     fly    (learners [M], inputs [M], keys) -> Flights [M]
+
+    No member's phase may change between where it is and `until`.
     """
 
     setup: Setup
@@ -235,18 +260,16 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
         def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
             return jax.lax.fori_loop(state.unrolls, until, lambda _, now: train_step(setup, inputs, now), state)
 
-        return sharding.map_states(one, states, inputs, until)
+        return sharding.map_states(one, states, inputs, until, states.unrolls < states.learning_unrolls)
 
     def apg(states: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
-        def updates(unrolls: chex.Array) -> chex.Array:
-            return (unrolls - config.learning_unrolls) // config.unrolls_per_apg_update
-
         def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
-            step = lambda i, now: apg_step(setup, inputs, i, now)  # noqa: E731
-            state = jax.lax.fori_loop(updates(state.unrolls), updates(until), step, state)
-            return state._replace(unrolls=until)
+            first = (state.unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
+            count = (until - state.unrolls) // config.unrolls_per_apg_update
+            step = lambda i, now: apg_step(setup, inputs, first + i, now)  # noqa: E731
+            return jax.lax.fori_loop(0, count, step, state)._replace(unrolls=until)
 
-        return sharding.map_states(one, states, inputs, until)
+        return sharding.map_states(one, states, inputs, until, states.unrolls >= states.learning_unrolls)
 
     def fly_members(learners: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
         return sharding.map_members(lambda m: fly(setup, m[0], m[1], keys), (learners, inputs))
