@@ -35,7 +35,7 @@ class Recording(NamedTuple):
 
 class Line(NamedTuple):
     name: str
-    colour: str
+    color: str
     values: np.ndarray  # [n, K + 1], or [n, K] if constant over a control period
     description: str = ""  # longer than the name
 
@@ -134,7 +134,7 @@ def _plain(values: np.ndarray, resolution: float) -> list[Any]:
 def _described(panel: Panel) -> dict[str, Any]:
     fields = {name: value for name, value in panel._asdict().items() if name not in ("lines", "resolution")}
     return fields | {
-        "lines": [{"name": line.name, "colour": line.colour, "description": line.description} for line in panel.lines]
+        "lines": [{"name": line.name, "color": line.color, "description": line.description} for line in panel.lines]
     }
 
 
@@ -173,7 +173,7 @@ def _vehicle(task: QuadrotorTask) -> dict[str, Any]:
     return {
         "vehicle": {
             "motors": [
-                {"position_m": motor.position_m, "max_N": motor.max_N, "colour": line.colour}
+                {"position_m": motor.position_m, "max_N": motor.max_N, "color": line.color}
                 for motor, line in zip(task.vehicle.motors, _motors(task), strict=True)
             ]
         },
@@ -187,8 +187,8 @@ def _vehicle(task: QuadrotorTask) -> dict[str, Any]:
 def _motors(task: QuadrotorTask) -> list[Line]:
     """Names, colors and places of the motors, without values: warm colors in front, darker ones on the left."""
     return [
-        Line(f"f{i} {arrow}", colour, np.zeros(0), f"the {place} motor")
-        for i, (arrow, colour, place) in enumerate((_place(motor) for motor in task.vehicle.motors), 1)
+        Line(f"f{i} {arrow}", color, np.zeros(0), f"the {place} motor")
+        for i, (arrow, color, place) in enumerate((_place(motor) for motor in task.vehicle.motors), 1)
     ]
 
 
@@ -198,8 +198,8 @@ def _place(motor: Motor) -> tuple[str, str, str]:
     # A plus frame has its motors on the axes.
     arrow = "↑↖←↙↓↘→↗"[eighth]
     place = ("front", "front left", "left", "rear left", "rear", "rear right", "right", "front right")[eighth]
-    colour = (FRONT[1], FRONT[0], FRONT[0], REAR[0], REAR[0], REAR[1], REAR[1], FRONT[1])[eighth]
-    return arrow, colour, place
+    color = (FRONT[1], FRONT[0], FRONT[0], REAR[0], REAR[0], REAR[1], REAR[1], FRONT[1])[eighth]
+    return arrow, color, place
 
 
 def _rod(task: PendulumTask) -> dict[str, Any]:
