@@ -241,7 +241,7 @@ def test_what_is_no_run_of_ours_is_refused(tmp_path: Path, capsys: pytest.Captur
     assert "not a run folder" in complaint(capsys, "view", tmp_path)
     run = tmp_path / "run"
     assert qrl("train", "fast", "--out", run, "--episode-length", "20", *TINY.split()) == 0
-    assert "expected a run of one of our own tasks, found Brax's 'fast'" in complaint(capsys, "view", run)
+    assert "expected a run of one of our own tasks, found another environment, 'fast'" in complaint(capsys, "view", run)
     shutil.rmtree(run / "checkpoints")
     config = json.loads((run / "config.json").read_text())
     config["task"] = {"name": "pendulum", "spec": tasks.load("pendulum").model_dump(mode="json", exclude_none=True)}
