@@ -78,9 +78,10 @@ def number(row: dict[str, float | str], key: str) -> float:
 
 def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, label: str = "") -> None:
     """Draw one run as a line, several as their median and a band of their range; `values` [runs, x]."""
-    low, median, high = np.full((3, values.shape[1]), np.nan)
+    quantiles = np.full((3, values.shape[1]), np.nan)
     finite = np.isfinite(values).any(axis=0)
-    low[finite], median[finite], high[finite] = np.nanquantile(values[:, finite], [0.0, 0.5, 1.0], axis=0)
+    quantiles[:, finite] = np.nanquantile(values[:, finite], [0.0, 0.5, 1.0], axis=0)
+    low, median, high = quantiles
     if len(values) > 1:
         axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0, label="range")
         axes.plot(steps, values.T, color=color, alpha=0.35, linewidth=0.8)
