@@ -91,7 +91,7 @@ def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
         *_verification(kernel, measured.verification),
         *_accuracy(measured, found),
         *_costs(policy, measured),
-        *_usage(),
+        USAGE,
     ]
     return "\n".join(lines)
 
@@ -168,13 +168,14 @@ def _costs(policy: Policy, measured: Measured) -> Iterable[str]:
     yield f"\nThe policy needs {1 / policy.control_period_s:,.0f} Hz.\n"
 
 
-def _usage() -> Iterable[str]:
-    yield "## Use\n"
-    yield (
-        "Add `qrl_policy.h` and `qrl_policy.c` to the firmware: C99, no libm, no heap, no state. The header documents"
-        " every input and output: order, unit, frame, range, motor positions and spins.\n\n"
-        "- `examples/bare_metal`: `make` runs it on the host; `CMakeLists.txt` for CMake.\n"
-        "- Arduino: this folder is a library; copy it to `libraries/qrl_policy`. PlatformIO: to `lib/qrl_policy`.\n"
-        "- Call `qrl_policy_selftest()` at boot and do not fly unless it returns 0.\n"
-        "- `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.\n"
-    )
+USAGE = """\
+## Use
+
+Add `qrl_policy.h` and `qrl_policy.c` to the firmware: C99, no libm, no heap, no state. The header documents\
+ every input and output: order, unit, frame, range, motor positions and spins.
+
+- `examples/bare_metal`: `make` runs it on the host; `CMakeLists.txt` for CMake.
+- Arduino: this folder is a library; copy it to `libraries/qrl_policy`. PlatformIO: to `lib/qrl_policy`.
+- Call `qrl_policy_selftest()` at boot and do not fly unless it returns 0.
+- `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.
+"""
