@@ -73,7 +73,6 @@ def _ranks(errors: np.ndarray) -> np.ndarray:
 
 
 def _settled(axes: Axes, task: Task, found: Measured, compared: dict[str, Measured], samples: int) -> None:
-    """The share of flights that have settled, over time."""
     times = np.arange(samples) * task.control_period_s
 
     def share(settle_s: np.ndarray) -> np.ndarray:

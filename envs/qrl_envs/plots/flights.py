@@ -67,7 +67,6 @@ def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None
 
 
 def _circle(axes: Axes, target: CircleReward) -> None:
-    """The target circle, dashed, with its direction."""
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     x, y = target.radius_m * np.cos(angle), target.radius_m * np.sin(angle)
     axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="target circle")

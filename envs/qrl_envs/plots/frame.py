@@ -27,7 +27,6 @@ ERRORS = {  # name in measures.py -> label; unit; name of its tolerance in the t
 
 
 def empty(task: Task, height_in: float) -> Figure:
-    """An empty figure, titled with the task."""
     figure = Figure(figsize=(10.0, height_in), dpi=PIXELS_PER_INCH, layout="constrained")
     FigureCanvasAgg(figure)
     title = textwrap.shorten(f"{task.reward.form}: {task.description}", 90, placeholder=" …")
@@ -63,14 +62,12 @@ def legend(figure: Figure) -> None:
 
 
 def in_pi(axis: Axis) -> None:
-    """Ticks at multiples of π/2."""
     names = {-2: "−π", -1: "−π/2", 0: "0", 1: "π/2", 2: "π"}
     axis.set_major_locator(MultipleLocator(np.pi / 2))
     axis.set_major_formatter(FuncFormatter(lambda value, _: names.get(round(value / (np.pi / 2)), "")))
 
 
 def successes(found: Measured) -> str:
-    """The number of flights that succeed, in words."""
     return f"{np.sum(found.success):,} of {len(found.success):,} flights succeed"
 
 
@@ -117,7 +114,6 @@ def over_time(axes: Axes, task: Task, panel: Panel) -> np.ndarray:
 
 
 def _tolerance(axes: Axes, panel: Panel, tolerance: float) -> None:
-    """The tolerance band, with dashed edges and its size as a label."""
     low, high = panel.target - tolerance, panel.target + tolerance
     if panel.scale == "log":
         low = panel.limits[0]

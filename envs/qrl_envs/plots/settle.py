@@ -67,7 +67,6 @@ def medians(tilt: np.ndarray, speed: np.ndarray, settle_s: np.ndarray, edges: np
 
 
 def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> None:
-    """Draw the cells in color, each with its number."""
     settled = cells[np.isfinite(cells)]
     low, high = (settled.min(), settled.max()) if len(settled) else (0.0, 1.0)
     high = max(high, low + 0.1)

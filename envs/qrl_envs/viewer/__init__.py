@@ -57,7 +57,6 @@ class Panel(NamedTuple):
 
 
 def page(task: Task, title: str, recording: Recording) -> str:
-    """The page's HTML for recorded flights of a task."""
     folder = resources.files("qrl_envs").joinpath("viewer")
     parts = {
         "policy": html.escape(POLICY),
@@ -148,7 +147,6 @@ def _in_units(task: Task, actions: np.ndarray) -> np.ndarray:
 
 
 def _start(task: Task, observation: np.ndarray) -> str:
-    """A short description of a start."""
     if isinstance(task, PendulumTask):
         return f"{np.degrees(np.arctan2(observation[1], observation[0])):.0f}°, {observation[2]:.1f} rad/s"
     tilt = np.degrees(np.arccos(np.clip(observation[8], -1.0, 1.0)))

@@ -32,7 +32,6 @@ class _Parser(argparse.ArgumentParser):
         sys.exit(WRONG_INPUT)
 
     def refuse(self, word: str) -> NoReturn:
-        """`word` is neither a flag nor an argument of this command."""
         flags = [flag for action in self._actions for flag in action.option_strings]
         close = difflib.get_close_matches(word.split("=")[0], flags, n=1) if word.startswith("-") else []
         self.error(
@@ -64,7 +63,6 @@ def positive(text: str) -> float:
 
 
 def build_parser() -> _Parser:
-    """The parser of all commands."""
     parser = _Parser(prog="qrl", description="From a task to a policy that flies from a microcontroller.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 

@@ -163,7 +163,6 @@ def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: fl
 
 
 def _exit_code(out: Path) -> int:
-    """The exit code of a finished sweep."""
     if (out / "best.json").exists():
         return DONE
     print_error(f"{out}: every member diverged; see results.csv")

@@ -49,7 +49,6 @@ def view(args: argparse.Namespace) -> int:
 
 
 def _requested(starts: list[int]) -> list[int]:
-    """The starts of --starts, without duplicates."""
     if max(starts) >= STARTS:
         raise BadInput(f"--starts: expected indices below {STARTS:,}, found {max(starts)}")
     unique = list(dict.fromkeys(starts))

@@ -40,7 +40,6 @@ def _templates(folder: Traversable, path: str = "") -> Iterable[tuple[str, str]]
 
 
 def _filled(text: str, values: dict[str, str]) -> str:
-    """`text` with every @placeholder@ replaced; KeyError if one is unknown."""
     return re.sub(r"@(\w+)@", lambda match: values[match[1]], text)
 
 
@@ -74,7 +73,6 @@ def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
 
 
 def _obs_ranges(kernel: Kernel) -> list[list[float]]:
-    """Smallest and largest of each observation, in its unit."""
     return (np.stack([kernel.obs_min, kernel.obs_max], axis=1) * kernel.lsb[:, None]).tolist()
 
 

@@ -60,7 +60,6 @@ def accumulator_bound(kernel: Kernel) -> int:
 
 
 def _check_fields(kernel: Kernel) -> None:
-    """Raise AccumulatorOverflow if a number does not fit its type in C."""
     ranges = [
         ("an input's scale", kernel.scale, 2**15, 2**16 - 1),
         ("an input's exponent", kernel.exponent, -(2**15), INT16),

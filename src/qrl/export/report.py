@@ -14,8 +14,6 @@ from qrl.export.verify import VerificationReport
 
 
 class FlightStats(NamedTuple):
-    """Statistics of flights from many starts."""
-
     summary: dict[str, float]  # as in evaluation.json
     success: NDArray[np.bool_] | None  # [starts]; None if the task does not measure it
     jitter: float  # mean change of an action from step to step over the tail, as a fraction of full scale
@@ -24,8 +22,6 @@ class FlightStats(NamedTuple):
 
 @dataclass(frozen=True)
 class Gate:
-    """One limit, passed if measured <= limit."""
-
     name: str
     measured: float
     limit: float
@@ -44,8 +40,6 @@ class Gate:
 
 @dataclass(frozen=True)
 class Measured:
-    """All that an export measured."""
-
     accuracy: Accuracy
     naive: Accuracy
     float_flights: FlightStats
@@ -75,7 +69,6 @@ def gates(measured: Measured) -> list[Gate]:
 
 
 def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
-    """report.md."""
     found = gates(measured)
     failed = [gate for gate in found if not gate.passed]
     network = "-".join(str(n) for n in (len(kernel.lsb), *(len(layer.bias) for layer in kernel.layers)))

@@ -140,13 +140,11 @@ def size(core: Core, kernel: Path, work: Path) -> Sizes:
 
 
 def _sections(path: Path, where: str) -> list[int]:
-    """Bytes of text, data and bss."""
     table = _build(["arm-none-eabi-size", path.name], path.parent, where)
     return [int(number) for number in table.splitlines()[1].split()[:3]]
 
 
 def _folder(work: Path, name: str, obs_f32: Floats, obs_i16: Ints) -> Path:
-    """A fresh folder with the observations in it."""
     folder = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=work))
     (folder / "f32.bin").write_bytes(np.ascontiguousarray(obs_f32, "<f4").tobytes())
     (folder / "i16.bin").write_bytes(np.ascontiguousarray(obs_i16, "<i2").tobytes())
@@ -232,7 +230,6 @@ def _instructions(core: Core, elapsed: Ints) -> Floats:
 
 
 def known_instructions(rounds: int) -> int:
-    """Instructions of the harness's function `known`."""
     return 2 * rounds + 3
 
 

@@ -61,7 +61,6 @@ class Axis:
         return self.choices[value] if isinstance(self.choices, dict) else {self.name: value}
 
     def names(self) -> list[str]:
-        """The settings that this axis sets."""
         if isinstance(self.choices, dict):
             return list(dict.fromkeys(key for settings in self.choices.values() for key in settings))
         return [self.name]

@@ -24,8 +24,6 @@ REPORT_BYTES = 3_000  # and for each report of a member: a row of some twenty nu
 
 
 class Sample(Spec):
-    """Random points, in place of the full grid."""
-
     count: Count
     seed: CountOrZero = 0
 
@@ -100,7 +98,6 @@ class Grid:
         return {"format": 1, "grid": self.file.model_dump(mode="json"), "points": points}
 
     def groups(self) -> list[list[int]]:
-        """Indices of the points of each compiled program."""
         groups: dict[str, list[int]] = {}
         for i, point in enumerate(self.points):
             groups.setdefault(point.static, []).append(i)
@@ -173,7 +170,6 @@ def _check_comparable(first: GridPoint, point: GridPoint, where: str) -> None:
 
 
 def describe(coordinates: dict[str, Any]) -> str:
-    """The coordinates as one line."""
     return ", ".join(
         f"{name} {value if isinstance(value, str) else json.dumps(value)}" for name, value in coordinates.items()
     )

@@ -75,7 +75,6 @@ def _finish(axes: Axes, found: Sequence[Summary], name: str, metric: str) -> Non
 
 
 def _heat_map(axes: Axes, found: Sequence[Summary], names: list[str], metric: str) -> None:
-    """Medians over both axes; a point without one stays grey."""
     down, across = (_labels(found, name) for name in names)
     cells = np.full((len(down), len(across)), np.nan)
     for f in found:

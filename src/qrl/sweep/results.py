@@ -28,7 +28,6 @@ def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
 
 
 def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
-    """Every report of every point and seed."""
     return [
         {**_label(grid, index), **{name: row[name] for name in CURVE}}
         for index, result in sorted(results.items())
@@ -97,7 +96,6 @@ def _rank(summary: Summary) -> tuple[bool, float, float]:
 
 
 def ranked(found: list[Summary]) -> list[Summary]:
-    """Best first."""
     return sorted(found, key=_rank, reverse=True)
 
 
@@ -117,7 +115,6 @@ def best_run_config(grid: Grid, results: dict[int, Result], point: int) -> RunCo
 
 
 def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Summary], seconds: float) -> None:
-    """results.csv, curves.csv, best.json and, last, summary.json."""
     files.replace_text(out / "results.csv", files.csv_text(table(grid, results)))
     files.replace_text(out / "curves.csv", files.csv_text(curves(grid, results)))
     winner = best(found)

@@ -30,8 +30,6 @@ CPU_CHUNK = 8
 
 
 class Member(NamedTuple):
-    """One point with one seed."""
-
     index: int  # in the sweep: index of the point · number of seeds + index of the seed
     seed: int
     inputs: MemberInputs
@@ -46,7 +44,6 @@ class Group:
 
     @property
     def steps(self) -> int:
-        """Environment steps of one member."""
         config = self.trainer.config
         return config.num_unrolls * config.steps_per_unroll
 
@@ -72,8 +69,6 @@ class Progress(NamedTuple):
 
 
 class ChunkDone(NamedTuple):
-    """A chunk is recorded."""
-
     chunk: int
     results: dict[int, Result]
     seconds: float

@@ -99,7 +99,6 @@ def _num_used(run: RunConfig) -> int:
 
 
 def describe_devices(run: RunConfig) -> str:
-    """The devices that a run trains on here, in words."""
     count, available = _num_used(run), jax.device_count()
     of = f" of {available}" if count < available else ""
     return f"{count}{of} {jax.default_backend()} device{'s' * (count > 1 or bool(of))}"

@@ -76,7 +76,6 @@ def this_process(index: int | None, count: int | None, coordinator: str | None, 
 
 
 def _number(flag: str, *values: int | str | None) -> int | None:
-    """The first that is given."""
     value = next((v for v in values if v is not None), None)
     try:
         return None if value is None else int(value)
@@ -85,7 +84,6 @@ def _number(flag: str, *values: int | str | None) -> int | None:
 
 
 def join(process: Process) -> None:
-    """Connect to the other processes, if there are any."""
     if process.of > 1 and not jax.distributed.is_initialized():
         try:
             jax.distributed.initialize(process.coordinator or None, process.of, process.number)
