@@ -117,16 +117,11 @@ def _add_hyperparameters(train: argparse.ArgumentParser) -> None:
         "hyperparameters", "Defaults are of the default preset; a task's preset sets others."
     )
     defaults = load_preset("default")
-    former: dict[str, list[str]] = {}
-    for old, new in FORMER_NAMES.items():
-        former.setdefault(new, []).append(old)
     for name, field in Config.model_fields.items():
         default = json.dumps(defaults[name])
         text = f"{field.description} (default {default})".replace("%", "%%")
-        unset: Any = {"dest": f"learner.{name}", "default": argparse.SUPPRESS}
-        group.add_argument(_flag(name), help=text, metavar=_metavar(field.annotation), **unset)
-        for old in former.get(name, ()):
-            group.add_argument(_flag(old), help=argparse.SUPPRESS, action=_FormerName, now=_flag(name), **unset)
+        kind = {"dest": f"learner.{name}", "default": argparse.SUPPRESS, "metavar": _metavar(field.annotation)}
+        group.add_argument(_flag(name), help=text, **kind)
 
 
 def _flag(name: str) -> str:
@@ -145,21 +140,16 @@ def _metavar(annotation: Any) -> str:
     return {int: "INT", float: "FLOAT", bool: "true|false"}.get(annotation, "VALUE")
 
 
-class _FormerName(argparse.Action):
-    """A flag of before, which says its name of today."""
-
-    def __init__(self, *args: Any, now: str, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.now = now
-
-    def __call__(self, parser: Any, namespace: argparse.Namespace, value: Any, option: str | None = None) -> None:
-        print(f"note: {option} is now {self.now}", flush=True)
-        setattr(namespace, self.dest, value)
-
-
 def _parse(argv: list[str] | None) -> argparse.Namespace:
+    words = list(sys.argv[1:] if argv is None else argv)
+    former = {_flag(old): _flag(name) for old, name in FORMER_NAMES.items()} if words[:1] == ["train"] else {}
+    for i, word in enumerate(words):
+        flag, equals, value = word.partition("=")
+        if flag in former:
+            print(f"note: {flag} is now {former[flag]}", flush=True)
+            words[i] = former[flag] + equals + value
     parser = build_parser()
-    args, unknown = parser.parse_known_args(argv)
+    args, unknown = parser.parse_known_args(words)
     if unknown:
         commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
         commands.choices[args.command].refuse(unknown[0])
@@ -211,7 +201,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _note_former_names(path: Path | None) -> None:
-    """The note of `_FormerName` for the hyperparameters of CONFIG or GRID; the command says if the file is wrong."""
+    """The note of a former flag, for the hyperparameters of CONFIG or GRID; the command says if the file is wrong."""
     with suppress(BadInput):
         data = read(path) if path else {}
         inside = [data.get(key) for key in ("learner", "fixed", "axes")]

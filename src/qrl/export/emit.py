@@ -5,8 +5,7 @@ import io
 import json
 import re
 from collections.abc import Iterable
-from importlib import resources
-from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,29 +17,21 @@ from qrl.export.policy import Policy
 from qrl.export.vectors import EMBEDDED, Vectors
 
 FORMAT = 1
+TEMPLATES = Path(__file__).parent / "templates"
 FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"
 
 
 def files(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
     """All emitted files except the report: path in the export folder -> text."""
     values = _values(policy, kernel, golden)
-    emitted = {path: _filled(text, values) for path, text in _templates(resources.files("qrl.export") / "templates")}
+    templates = {str(path.relative_to(TEMPLATES)): path for path in TEMPLATES.rglob("*") if path.is_file()}
+    emitted = {
+        name: re.sub(r"@(\w+)@", lambda match: values[match[1]], path.read_text(encoding="utf-8"))
+        for name, path in templates.items()
+    }
     emitted["manifest.json"] = json.dumps(manifest(policy, kernel), indent=2) + "\n"
     emitted["golden.csv"] = _golden_csv(policy, golden)
     return emitted
-
-
-def _templates(folder: Traversable, path: str = "") -> Iterable[tuple[str, str]]:
-    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        name = f"{path}{entry.name}"
-        if entry.is_dir():
-            yield from _templates(entry, f"{name}/")
-        else:
-            yield name, entry.read_text(encoding="utf-8")
-
-
-def _filled(text: str, values: dict[str, str]) -> str:
-    return re.sub(r"@(\w+)@", lambda match: values[match[1]], text)
 
 
 def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
@@ -65,7 +56,7 @@ def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
         "seed": run.seed,
         "env_steps": run.env_steps,
         "control_period_s": policy.control_period_s,
-        "network": [len(policy.observations), *(len(layer.bias) for layer in kernel.layers)],
+        "network": kernel.widths,
         "activation": kernel.activation,
         "obs": obs,
         "act": act,
@@ -82,10 +73,10 @@ def _act_ranges(kernel: Kernel) -> list[list[float]]:
 
 def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
     """Values of the templates' @placeholders@."""
-    run = policy.provenance
+    run, network = policy.provenance, "-".join(map(str, kernel.widths))
     banner = [
         f" * {run.task}: {run.description}.",
-        f" * A policy trained by qrl, exported as an integer network {_network(policy)} ({kernel.activation}).",
+        f" * A policy trained by qrl, exported as an integer network {network} ({kernel.activation}).",
         f" * Run {run.run}, seed {run.seed}, {run.env_steps:,} environment steps, commit {run.commit}.",
     ]
     return {
@@ -110,14 +101,10 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
         "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
-        "widest": str(max(_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers))),
+        "widest": str(max(map(_padded, kernel.widths))),
         "tanh": str(int(kernel.activation == "tanh")),
         "tables": _tables(kernel, golden),
     }
-
-
-def _network(policy: Policy) -> str:
-    return "-".join(str(n) for n in (len(policy.observations), *(len(bias) for _, bias in policy.layers)))
 
 
 def _comment_safe(text: str) -> str:
@@ -148,7 +135,7 @@ def _padded(n: int) -> int:
 
 
 def _tables(kernel: Kernel, golden: Vectors) -> str:
-    sizes = [_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers)]
+    sizes = list(map(_padded, kernel.widths))
     columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max
     inputs = (f"{{{s}u, {e}, {low}, {high}}}" for s, e, low, high in zip(*columns, strict=True))
     parts = [

@@ -41,6 +41,11 @@ class Kernel:
         """The step of each observation, in its unit; [F]."""
         return 2.0 ** (self.exponent - 142) / self.scale
 
+    @property
+    def widths(self) -> list[int]:
+        """Numbers of observations, of each hidden layer's units and of actions."""
+        return [len(self.scale), *(len(layer.bias) for layer in self.layers)]
+
 
 class AccumulatorOverflow(ArithmeticError):
     """An accumulator or a field of the kernel could exceed its type in C."""

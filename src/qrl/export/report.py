@@ -71,9 +71,8 @@ def gates(measured: Measured) -> list[Gate]:
 def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
     found = gates(measured)
     failed = [gate for gate in found if not gate.passed]
-    network = "-".join(str(n) for n in (len(kernel.lsb), *(len(layer.bias) for layer in kernel.layers)))
     run = policy.provenance
-    lines = [f"# {run.task}: {network} {kernel.activation}, int8", ""]
+    lines = [f"# {run.task}: {'-'.join(map(str, kernel.widths))} {kernel.activation}, int8", ""]
     lines += [f"> **Warning: failed: {gate}.**" for gate in failed]
     if failed:
         lines += ["> The C matches the integer reference; the integer policy differs this much from the float one.", ""]

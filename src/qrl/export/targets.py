@@ -198,16 +198,17 @@ def _read(
     found = {name: fields.get(name) for name in expected}
     if wrong := [f"{name}: expected {n}, found {found[name]}" for name, n in expected.items() if found[name] != n]:
         raise VerificationFailed(f"{where}: {', '.join(wrong)}")
+    act, bytes_act = fields["act"], 4 * (fields["act"] + 2)
     layouts = [
-        np.dtype([("status", "<i4"), ("act", t, fields["act"]), ("guard", t, 2), ("elapsed", "<i4", 2)], align=True)
-        for t in ("<f4", "<i2")
+        np.dtype([("status", "<i4"), ("act", t, act), ("guard", "u1", bytes_act - act * each), ("elapsed", "<i4", 2)])
+        for t, each in (("<f4", 4), ("<i2", 2))
     ]
     data, split = (folder / "out.bin").read_bytes(), len(obs_f32) * layouts[0].itemsize
     if len(data) != (length := split + len(obs_i16) * layouts[1].itemsize):
         raise VerificationFailed(f"{where}: out.bin: expected {length} bytes, found {len(data)}")
     f32, i16 = np.frombuffer(data[:split], layouts[0]), np.frombuffer(data[split:], layouts[1])
     for records, entry in ((f32, "qrl_policy_step"), (i16, "qrl_policy_step_i16")):
-        if np.any(np.ascontiguousarray(records["guard"]).view(np.uint8) != GUARD):
+        if np.any(records["guard"] != GUARD):
             raise VerificationFailed(f"{where}: {entry} writes past the end of its outputs")
     outputs = Outputs(f32["status"], f32["act"], i16["status"], i16["act"], fields["selftest"])
     return outputs, fields, (f32["elapsed"], i16["elapsed"])

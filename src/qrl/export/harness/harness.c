@@ -2,7 +2,7 @@
 
    Reads   f32.bin  observations, float32 little-endian [N, OBS]
            i16.bin  observations, int16 [M, OBS]
-   Writes  out.bin  N records of one layout, then M of the other: status, act, guard, elapsed (below)
+   Writes  out.bin  N + M records (below)
    and finally exactly one line of text that begins "qrl-result:", with counts, the self-test's result and the
    measurements. An error is one line that begins "qrl-error:". */
 #include <string.h>
@@ -10,27 +10,22 @@
 #include "platform.h"
 #include "qrl_policy.h"
 
-/* A chunk's observations and records of both kinds take at most 3.5 KB unless one vector takes more. */
 enum { OBS = QRL_POLICY_OBS_SIZE, ACT = QRL_POLICY_ACT_SIZE, POISON = 0xA5 };
-enum { EACH = OBS + ACT + 6, CHUNK = EACH < 560 ? 560 / EACH : 1 };
 
-/* The kernel writes into a poisoned record, which reveals a missing output or one too many. */
-static struct record_f32 {
+static union {
+    float f32[OBS];
+    int16_t i16[OBS];
+} obs;
+
+/* Poisoned before each call, which reveals a missing output or one too many. */
+static struct {
     int32_t status;
-    float act[ACT];
-    float guard[2];
+    union {
+        float f32[ACT + 2];
+        int16_t i16[ACT + 2];
+    } act;
     struct elapsed elapsed;
-} records_f32[CHUNK];
-
-static struct record_i16 {
-    int32_t status;
-    int16_t act[ACT];
-    int16_t guard[2];
-    struct elapsed elapsed;
-} records_i16[CHUNK];
-
-static float obs_f32[CHUNK][OBS];
-static int16_t obs_i16[CHUNK][OBS];
+} record;
 
 static void require(int good, const char *error)
 {
@@ -42,47 +37,20 @@ static void require(int good, const char *error)
     }
 }
 
-/* Reads the next vectors of `file`, as many as fit a chunk; returns their number, 0 at the end. */
-static uint32_t next_vectors(intptr_t file, void *into, uint32_t bytes_each)
-{
-    uint32_t bytes = file_read(file, into, CHUNK * bytes_each);
-    require(bytes % bytes_each == 0, "an observation file ends within a vector");
-    return bytes / bytes_each;
-}
-
-static int32_t run_f32(intptr_t out)
+/* Runs one entry point over the observations of a file, and returns their number. */
+static int32_t run(intptr_t out, const char *name, uint32_t bytes_each, int fixed_point)
 {
     int32_t total = 0;
-    uint32_t count;
-    intptr_t in = file_open("f32.bin", 0);
-    require(in != 0, "f32.bin cannot be read");
-    while ((count = next_vectors(in, obs_f32, sizeof obs_f32[0])) != 0) {
-        memset(records_f32, POISON, sizeof records_f32);
-        for (uint32_t i = 0; i < count; i++) {
-            records_f32[i].status = call_f32(obs_f32[i], records_f32[i].act, &records_f32[i].elapsed);
-        }
-        uint32_t bytes = count * (uint32_t)sizeof records_f32[0];
-        require(file_write(out, records_f32, bytes) == bytes, "out.bin cannot be written");
-        total += (int32_t)count;
-    }
-    file_close(in);
-    return total;
-}
-
-static int32_t run_i16(intptr_t out)
-{
-    int32_t total = 0;
-    uint32_t count;
-    intptr_t in = file_open("i16.bin", 0);
-    require(in != 0, "i16.bin cannot be read");
-    while ((count = next_vectors(in, obs_i16, sizeof obs_i16[0])) != 0) {
-        memset(records_i16, POISON, sizeof records_i16);
-        for (uint32_t i = 0; i < count; i++) {
-            records_i16[i].status = call_i16(obs_i16[i], records_i16[i].act, &records_i16[i].elapsed);
-        }
-        uint32_t bytes = count * (uint32_t)sizeof records_i16[0];
-        require(file_write(out, records_i16, bytes) == bytes, "out.bin cannot be written");
-        total += (int32_t)count;
+    uint32_t bytes;
+    intptr_t in = file_open(name, 0);
+    require(in != 0, "an observation file cannot be read");
+    while ((bytes = file_read(in, &obs, bytes_each)) != 0) {
+        require(bytes == bytes_each, "an observation file ends within a vector");
+        memset(&record, POISON, sizeof record);
+        record.status = fixed_point ? call_i16(obs.i16, record.act.i16, &record.elapsed)
+                                    : call_f32(obs.f32, record.act.f32, &record.elapsed);
+        require(file_write(out, &record, sizeof record) == sizeof record, "out.bin cannot be written");
+        total++;
     }
     file_close(in);
     return total;
@@ -127,10 +95,10 @@ int main(void)
     call_known(12345, &elapsed);
     report_elapsed("known_12345_ticks", "known_12345_spins", elapsed);
     stack_paint();
-    report("vectors_f32", run_f32(out));
+    report("vectors_f32", run(out, "f32.bin", sizeof obs.f32, 0));
     report("stack_f32", stack_depth());
     stack_paint();
-    report("vectors_i16", run_i16(out));
+    report("vectors_i16", run(out, "i16.bin", sizeof obs.i16, 1));
     report("stack_i16", stack_depth());
     stack_paint();
     report("selftest", call_selftest(&elapsed));
