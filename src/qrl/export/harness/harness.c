@@ -38,7 +38,7 @@ static void require(int good, const char *error)
 }
 
 /* Runs one entry point over the observations of a file, and returns their number. */
-static int32_t run(intptr_t out, const char *name, uint32_t bytes_each, int fixed_point)
+static int32_t run(intptr_t out, const char *name, uint32_t bytes_each, enum entry entry)
 {
     int32_t total = 0;
     uint32_t bytes;
@@ -47,8 +47,7 @@ static int32_t run(intptr_t out, const char *name, uint32_t bytes_each, int fixe
     while ((bytes = file_read(in, &obs, bytes_each)) != 0) {
         require(bytes == bytes_each, "an observation file ends within a vector");
         memset(&record, POISON, sizeof record);
-        record.status = fixed_point ? call_i16(obs.i16, record.act.i16, &record.elapsed)
-                                    : call_f32(obs.f32, record.act.f32, &record.elapsed);
+        record.status = call(entry, &obs, &record.act, &record.elapsed);
         require(file_write(out, &record, sizeof record) == sizeof record, "out.bin cannot be written");
         total++;
     }
@@ -75,35 +74,33 @@ static void report(const char *name, int32_t value)
     strcat(line, first);
 }
 
-static void report_elapsed(const char *ticks_name, const char *spins_name, struct elapsed elapsed)
+static int report_call(enum entry entry, uintptr_t rounds, const char *ticks_name, const char *spins_name)
 {
+    struct elapsed elapsed;
+    int status = call(entry, (const void *)rounds, 0, &elapsed);
     report(ticks_name, elapsed.ticks);
     report(spins_name, elapsed.spins);
+    return status;
 }
 
 int main(void)
 {
-    struct elapsed elapsed;
     intptr_t out = file_open("out.bin", 1);
     require(out != 0, "out.bin cannot be written");
     report("obs", OBS);
     report("act", ACT);
-    call_known(0, &elapsed);
-    report_elapsed("known_0_ticks", "known_0_spins", elapsed);
-    call_known(1000, &elapsed);
-    report_elapsed("known_1000_ticks", "known_1000_spins", elapsed);
-    call_known(12345, &elapsed);
-    report_elapsed("known_12345_ticks", "known_12345_spins", elapsed);
+    report_call(KNOWN, 0, "known_0_ticks", "known_0_spins");
+    report_call(KNOWN, 1000, "known_1000_ticks", "known_1000_spins");
+    report_call(KNOWN, 12345, "known_12345_ticks", "known_12345_spins");
     stack_paint();
-    report("vectors_f32", run(out, "f32.bin", sizeof obs.f32, 0));
+    report("vectors_f32", run(out, "f32.bin", sizeof obs.f32, STEP));
     report("stack_f32", stack_depth());
     stack_paint();
-    report("vectors_i16", run(out, "i16.bin", sizeof obs.i16, 1));
+    report("vectors_i16", run(out, "i16.bin", sizeof obs.i16, STEP_I16));
     report("stack_i16", stack_depth());
     stack_paint();
-    report("selftest", call_selftest(&elapsed));
+    report("selftest", report_call(SELFTEST, 0, "selftest_ticks", "selftest_spins"));
     report("stack_selftest", stack_depth());
-    report_elapsed("selftest_ticks", "selftest_spins", elapsed);
     require(file_close(out) == 0, "out.bin cannot be written");
     strcat(line, "\n");
     print_text(line);
