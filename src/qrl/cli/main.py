@@ -120,8 +120,8 @@ def _add_hyperparameters(train: argparse.ArgumentParser) -> None:
     for name, field in Config.model_fields.items():
         default = json.dumps(defaults[name])
         text = f"{field.description} (default {default})".replace("%", "%%")
-        kind = {"dest": f"learner.{name}", "default": argparse.SUPPRESS, "metavar": _metavar(field.annotation)}
-        group.add_argument(_flag(name), help=text, **kind)
+        kind, dest = _metavar(field.annotation), f"learner.{name}"
+        group.add_argument(_flag(name), dest=dest, default=argparse.SUPPRESS, metavar=kind, help=text)
 
 
 def _flag(name: str) -> str:

@@ -171,10 +171,7 @@ class Writer:
             # Orbax prints tracebacks when the disk fills up during a save.
             if shutil.disk_usage(path.parent).free < sum(leaf.nbytes for leaf in state.values()) * 5 // 4 + 2**20:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            with (
-                plain_path(path.parent) as plain,
-                ocp.CheckpointManager(plain, options=options) as orbax,
-            ):
+            with plain_path(path.parent) as plain, ocp.CheckpointManager(plain, options=options) as orbax:
                 orbax.save(checkpoint.env_steps, args=items, force=True)
             self._check_folder()  # if it was removed meanwhile, Orbax has created it again
             integrity.write_manifest(path)

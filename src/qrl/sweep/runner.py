@@ -29,7 +29,8 @@ from qrl.training.trainer import Trainer
 CPU_CHUNK = 8
 
 
-class Member(NamedTuple):
+@dataclass(frozen=True)
+class Member:
     index: int  # in the sweep: index of the point · number of seeds + index of the seed
     seed: int
     inputs: MemberInputs
