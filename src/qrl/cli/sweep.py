@@ -172,7 +172,7 @@ def _exit_code(out: Path) -> int:
 def _print_table(summaries: list[results.Summary], seeds: int) -> None:
     """The best points, best first: median and quartiles over seeds."""
     rows = [
-        [*(_cell(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
+        [*(grids.text(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
         + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
         for f in results.ranked(summaries)[:SHOWN]
     ]
@@ -182,10 +182,6 @@ def _print_table(summaries: list[results.Summary], seeds: int) -> None:
         console.print("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
     if len(summaries) > SHOWN:
         console.print(f"… and {len(summaries) - SHOWN:,} more in summary.json")
-
-
-def _cell(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _spread(quartiles: dict[str, float], form: str) -> str:

@@ -170,9 +170,11 @@ def _check_comparable(first: GridPoint, point: GridPoint, where: str) -> None:
 
 
 def describe(coordinates: dict[str, Any]) -> str:
-    return ", ".join(
-        f"{name} {value if isinstance(value, str) else json.dumps(value)}" for name, value in coordinates.items()
-    )
+    return ", ".join(f"{name} {text(value)}" for name, value in coordinates.items())
+
+
+def text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _sampled(axes: list[Axis], sample: Sample, where: str) -> list[list[Any]]:
