@@ -34,7 +34,7 @@ define HELP
        ARGS="--only pendulum"          one task; --fresh, --out FOLDER
   make gallery                       docs/gallery.md: the figures, the shipped presets' flights, ablation and bench
        FAST=1                          with the figures of FAST=1; ARGS="--out FOLDER", --fresh
-  make bench                         timings beside peers, each in an environment of its own: downloads them
+  make bench                         timings beside other libraries, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Every command end to end on a CPU, with tiny budgets, in under three minutes: `make smoke`.
+# Every command end to end on a CPU, with tiny budgets: `make smoke`.
 #
 # It proves the contracts of the command line (DESIGN.md, Sec. 3), so it stands with the other proofs; it is not a
 # pytest because it goes the user's way: through make, a process for each command, and signals.
@@ -134,7 +134,7 @@ pendulum_and_hover() {
 
 sweep_pendulum() {
   cat >"$work/grid.json" <<'JSON'
-{"task": "pendulum", "fixed": {"steps": 2e4, "reports": 2, "num_eval_envs": 10},
+{"task": "pendulum", "fixed": {"num_timesteps": 2e4, "num_evals": 2, "num_eval_envs": 10},
  "axes": {"learning_rate": {"from": 1e-3, "to": 1e-2, "count": 2, "spacing": "log"}, "task.rod.mass_kg": [1, 1.5]},
  "seeds": 2}
 JSON

@@ -49,7 +49,7 @@ RANGE = {"from": 1e-3, "to": 0.5, "spacing": "log"}
 SPANNED = {"task": "circle", "axes": {"sigma": RANGE | {"count": 3}}, "seeds": [4, 7]}
 SAMPLED = {"task": "hover", "axes": {"sigma": RANGE, "lam": [0.5, 1]}, "sample": {"count": 5, "seed": 1}}
 FILE = specfile.build(grid.GridFile, LISTED, "")
-GRID = grid.Grid(FILE, {}, [grid.GridPoint({"gamma": 0.9}, PENDULUM, LEARNER)])
+GRID = grid.Grid(FILE, [grid.GridPoint({"gamma": 0.9}, PENDULUM, LEARNER)])
 
 ROW = {"env_steps": 200, "updates": 4, "return_mean": -1.5, "return_min": -3.25, "success": math.nan}
 ROWS = [ROW | {"train_seconds": 0.5, "value": 1e-9}, ROW | {"env_steps": 400, "train_seconds": 1.25, "value": 0.0}]

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from qrl import tasks
-from qrl.cli.main import _parse, limit_size
+from qrl.cli.main import _note_former_names, _parse, limit_size
 from qrl.config import FORMER_NAMES, Config
 from qrl.request import config_file
 from qrl_envs.specfile import BadInput
@@ -29,6 +29,20 @@ def test_former_names_in_a_file_are_those_of_today(tmp_path: Path) -> None:
     path.write_text('{"learner": {"lanes": 8, "num_envs": 8}}')
     with pytest.raises(BadInput, match=r"config\.json: learner: key 'lanes': is called 'num_envs' now"):
         config_file(path)
+
+
+def test_a_file_with_a_former_name_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As a flag is; in a task, `episode_steps` is today's name."""
+    path = tmp_path / "file.json"
+    path.write_text(
+        '{"task": {"spec": {"episode_steps": 1}}, "learner": {"lanes": 8}, "axes": {"m": {"a": {"steps": 1}}}}'
+    )
+    _note_former_names(path)
+    notes = {f"note: {path}: lanes is now num_envs", f"note: {path}: steps is now num_timesteps"}
+    assert set(capsys.readouterr().out.splitlines()) == notes
+    _note_former_names(tmp_path / "nowhere.json")
+    _note_former_names(None)
+    assert not capsys.readouterr().out
 
 
 def test_help_gives_type_and_default_of_each_hyperparameter(capsys: pytest.CaptureFixture[str]) -> None:

@@ -102,11 +102,11 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
         return dict(zip((core.name for core in CORES), pool.map(run, CORES), strict=True))
 
 
-def on(core: Core | None, kernel: Path, work: Path, timeout_s: float = targets.TIMEOUT_S) -> Outputs:
+def on(core: Core | None, kernel: Path, work: Path) -> Outputs:
     """`kernel` on a core, or on the host where there is none."""
     if core is None:
-        return targets.run_host(kernel, work, RELEASE, OBS_F32, OBS_I16, timeout_s=timeout_s)
-    return targets.run_core(core, kernel, work, RELEASE, OBS_F32, OBS_I16, timeout_s=timeout_s)[0]
+        return targets.run_host(kernel, work, RELEASE, OBS_F32, OBS_I16)
+    return targets.run_core(core, kernel, work, RELEASE, OBS_F32, OBS_I16)[0]
 
 
 def bits(values: np.ndarray) -> np.ndarray:
@@ -183,11 +183,12 @@ def test_a_crash_fails(core: Core | None, tmp_path: Path) -> None:
 
 
 @EITHER
-def test_a_hang_fails(core: Core | None, tmp_path: Path) -> None:
+def test_a_hang_fails(core: Core | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(targets, "TIMEOUT_S", 0.7)
     hang = f'while (obs[1] == {OBS_I16[ODD, 1]}) {{ __asm__ volatile(""); }}'
     kernel = write(tmp_path / "kernel", ("/* end of i16 */", hang))
     with pytest.raises(VerificationFailed, match=r"timed out after 0.7 s"):
-        on(core, kernel, tmp_path, timeout_s=0.7)
+        on(core, kernel, tmp_path)
 
 
 @EITHER
@@ -223,12 +224,13 @@ def test_an_end_that_is_not_the_harnesss_own_fails(selftest: str, words: str, tm
 
 
 @pytest.mark.usefixtures("cross")
-def test_a_restart_on_a_core_fails(tmp_path: Path) -> None:
+def test_a_restart_on_a_core_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(targets, "TIMEOUT_S", 0.7)
     kernel = write(
         tmp_path / "kernel", ("/* selftest */", "void (**volatile reset)(void) = (void (**)(void))4; (*reset)();")
     )
     with pytest.raises(VerificationFailed, match=r"timed out after|processor fault"):
-        on(M3, kernel, tmp_path, timeout_s=0.7)
+        on(M3, kernel, tmp_path)
 
 
 @EITHER

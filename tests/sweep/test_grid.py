@@ -156,7 +156,7 @@ def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -
 
 GAMMA = {"gamma": [0.9, 0.99]}
 WRONG: dict[str, tuple[dict, str]] = {
-    "misspelt axis": ({"axes": {"gama": [0.9]}}, r"axes: unknown key 'gama' \(did you mean 'gamma'\?\)"),
+    "misspelt axis": ({"axes": {"gama": [0.9]}}, r"axes.gama: unknown key 'gama' \(did you mean 'gamma'\?\)"),
     "misspelt path": (
         {"axes": {"task.rod.mas_kg": [1.0]}},
         r"unknown key 'task.rod.mas_kg' \(did you mean 'task.rod.mass_kg'\?\)",
@@ -175,6 +175,10 @@ WRONG: dict[str, tuple[dict, str]] = {
     "empty axis": ({"axes": {"gamma": []}}, r"key 'axes.gamma': expected at least one value, found none"),
     "empty named settings": ({"axes": {"m": {}}}, r"key 'axes.m': expected at least one value"),
     "wrong type of axis": ({"axes": {"gamma": 0.9}}, r"key 'axes.gamma': expected a list of values, .* found 0.9"),
+    "a number for a list of layers": (
+        {"axes": {"policy_hidden_layer_sizes": [64, [64, 64]]}},
+        r"at policy_hidden_layer_sizes 64: key 'policy_hidden_layer_sizes': expected a list .* such as \[64\]",
+    ),
     "wrong type of value": ({"axes": {"gamma": ["much"]}}, r"at gamma much: key 'gamma': expected a valid number"),
     "wrong sense": ({"axes": {"sigma": [0.5, -1.0]}}, r"at sigma -1.0: key 'sigma': expected greater than 0"),
     "not a number": ({"axes": {"sigma": [float("nan")]}}, r"key 'sigma': expected a finite number"),
@@ -188,9 +192,12 @@ WRONG: dict[str, tuple[dict, str]] = {
     ),
     "called like a column": (
         {"axes": {"seeds": {"a": {"gamma": 0.9}}}},
-        r"key 'axes.seeds': expected another name than that of a column of results.csv, found 'seeds'",
+        r"key 'axes.seeds': expected another name than that of a setting or a column of results.csv",
     ),
-    "called like a measure": ({"axes": {"rms_angle_rad": {"a": {"gamma": 0.9}}}}, r"another name than .* 'rms_angle"),
+    "called like a measure": (
+        {"axes": {"rms_angle_rad": {"a": {"gamma": 0.9}}}},
+        r"'axes.rms_angle_rad': expected another name",
+    ),
     "an axis without a name": ({"axes": {"": {"a": {"gamma": 0.9}}}}, r"expected a name for the axis, found \"\""),
     "settings without a name": ({"axes": {"m": {"": {"gamma": 0.9}}}}, r"'axes.m': expected a name for each of its"),
     "too large for single precision": (

@@ -404,14 +404,14 @@ def test_quartiles_are_numpys_and_divergence_counts_as_the_worst(three_points: A
     assert second["return_mean"]["median"] == np.median([-np.inf, 5.0, 6.0, 8.0]) == 5.5
     assert third["return_mean"]["median"] == -np.inf
     assert [f["diverged"] for f in (first, second, third)] == [0, 1, 3]
-    assert results.best([first, second, third], found, 4) == 1
+    assert results.best([first, second, third]) == 1
 
 
 def test_success_ranks_before_return_and_the_middle_seed_repeats(three_points: Any) -> None:
     values = [[(9.0, 0.5)] * 4, [(4.0, 1.0), (1.0, 1.0), (3.0, 1.0), (2.0, 1.0)], [(1.0, 1.0)] * 4]
     found = {4 * i + j: result(*v) for i, vs in enumerate(values) for j, v in enumerate(vs)}
     findings = results.summaries(three_points, found)
-    assert results.best(findings, found, 4) == 1
+    assert results.best(findings) == 1
     assert [f["point"] for f in results.ranked(findings)] == [1, 2, 0]
     assert results.best_run_config(three_points, found, 1).seed == 3  # of returns 4, 1, 3, 2 the lower median, 2
 
@@ -446,7 +446,7 @@ def test_a_seed_that_diverged_never_settled(three_points: Any) -> None:
 
 def test_where_all_diverge_there_is_no_best(three_points: Any) -> None:
     found = {i: result(1.0, diverged="NaN") for i in range(12)}
-    assert results.best(results.summaries(three_points, found), found, 4) is None
+    assert results.best(results.summaries(three_points, found)) is None
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,4 @@
-"""Plots of flights as PNG: the first flights (`flights.draw`), the errors of all flights over time (`errors.draw`), and
-settle times over the start's tilt and speed (`settle.draw`).
+"""Plots of flights as PNG: the first flights, the errors of all over time, and settle times over the start.
 
-Errors are those of `measures`, tolerances those of the task. `figure` returns what `draw` saves; both use matplotlib's
-objects without pyplot, so no global state is left.
+Errors are those of `measures`, tolerances those of the task. `figure` returns what `draw` saves, without pyplot.
 """

@@ -11,15 +11,13 @@ from matplotlib.figure import Figure
 
 from qrl_envs import measures
 from qrl_envs.measures import Measured
-from qrl_envs.plots.frame import COLOURS, empty, finish, legend
-from qrl_envs.plots.measured import ERRORS, successes
-from qrl_envs.plots.overtime import Panel, logarithmic, over_time
+from qrl_envs.plots.frame import COLORS, ERRORS, Panel, empty, finish, legend, logarithmic, over_time, successes
 from qrl_envs.task import Task
 
 LINES: tuple[dict[str, Any], ...] = (  # distinguishable without color
-    {"color": COLOURS[1], "linestyle": "-"},
-    {"color": COLOURS[2], "linestyle": (0, (5, 1.5))},
-    {"color": COLOURS[3], "linestyle": (0, (1, 1))},
+    {"color": COLORS[1], "linestyle": "-"},
+    {"color": COLORS[2], "linestyle": (0, (5, 1.5))},
+    {"color": COLORS[3], "linestyle": (0, (1, 1))},
     {"color": "black", "linestyle": (0, (5, 1.5, 1, 1.5))},
 )
 SHORT = 24  # characters of a name in the legend
@@ -27,15 +25,14 @@ Others = Mapping[str, np.ndarray]  # name -> observations [n, K + 1, F] of anoth
 
 
 def draw(path: Path, task: Task, observations: np.ndarray, others: Others = MappingProxyType({})) -> None:
-    """Save the errors and the settled share over time of flights with `observations` [n, K + 1, F], in SI units.
-
-    For comparison it shows the median errors and settled share of the first few of `others`.
-    """
     figure(task, observations, others).savefig(path, format="png")
 
 
 def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyType({})) -> Figure:
-    """The figure of `draw`. Axes: the spread of each error over time, and last the share that has settled."""
+    """Errors and settled share over time of flights with `observations` [n, K + 1, F], in SI units.
+
+    Axes: the spread of each error, and last the share that has settled; with the medians of the first few `others`.
+    """
     found = measures.of_flights(task, observations)
     compared = {name: measures.of_flights(task, other) for name, other in list(others.items())[: len(LINES)]}
     names = [name for name in ERRORS if name in found.errors]
@@ -47,8 +44,8 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
         panel = logarithmic(label, unit, _ranks(found.errors[name]), getattr(task.evaluation, tolerance))
         times = over_time(axes, task, panel)
         low, median, high = panel.values
-        axes.fill_between(times, low, high, color=COLOURS[0], alpha=0.3, linewidth=0, label="5 % to 95 % of flights")
-        axes.plot(times, median, color=COLOURS[0], linewidth=2, label="median flight")
+        axes.fill_between(times, low, high, color=COLORS[0], alpha=0.3, linewidth=0, label="5 % to 95 % of flights")
+        axes.plot(times, median, color=COLORS[0], linewidth=2, label="median flight")
         for (other, there), looks in zip(compared.items(), LINES, strict=False):
             line = np.clip(_ranks(there.errors[name])[1], *panel.limits)
             axes.plot(times, line, linewidth=1.1, label=f"median of {_short(other)}", **looks)
@@ -76,13 +73,12 @@ def _ranks(errors: np.ndarray) -> np.ndarray:
 
 
 def _settled(axes: Axes, task: Task, found: Measured, compared: dict[str, Measured], samples: int) -> None:
-    """The share of flights that have settled, over time."""
     times = np.arange(samples) * task.control_period_s
 
     def share(settle_s: np.ndarray) -> np.ndarray:
         return 100.0 * np.mean(settle_s[:, None] <= times + 0.5 * task.control_period_s, axis=0)
 
     over_time(axes, task, Panel("flights settled", "%", share(found.settle_s)[None], (0.0, 103.0)))
-    axes.plot(times, share(found.settle_s), color=COLOURS[0], linewidth=2)
+    axes.plot(times, share(found.settle_s), color=COLORS[0], linewidth=2)
     for (other, there), looks in zip(compared.items(), LINES, strict=False):
         axes.plot(times, share(there.settle_s), linewidth=1.1, label=f"median of {_short(other)}", **looks)

@@ -7,21 +7,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qrl_envs import measures
-from qrl_envs.plots.frame import COLOURS, INK, empty, finish, in_pi, legend
-from qrl_envs.plots.measured import successes
-from qrl_envs.plots.overtime import Panel, logarithmic, over_time
+from qrl_envs.plots.frame import COLORS, INK, Panel, empty, finish, in_pi, legend, logarithmic, over_time, successes
 from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
 
 SHOWN = 5  # flights
 
 
 def draw(path: Path, task: Task, observations: np.ndarray) -> None:
-    """Save a plot of the first flights of `observations` [n, K + 1, F], in SI units."""
     figure(task, observations).savefig(path, format="png")
 
 
 def figure(task: Task, observations: np.ndarray) -> Figure:
-    """The figure of `draw`. Axes: paths, and two quantities over time."""
+    """The first flights of `observations` [n, K + 1, F], in SI units. Axes: paths, and two quantities over time."""
     found = measures.of_flights(task, observations)
     shown = np.where(np.isfinite(observations), observations, np.nan)[:SHOWN]
     figure = empty(task, height_in=5.0)
@@ -34,9 +31,9 @@ def figure(task: Task, observations: np.ndarray) -> Figure:
         panels = _quadrotor_panels(task, shown, found.errors)
     for axes, panel in zip((upper, lower), panels, strict=True):
         times = over_time(axes, task, panel)
-        for colour, values in zip(COLOURS, panel.values, strict=False):
+        for color, values in zip(COLORS, panel.values, strict=False):
             for line in _turns(values) if panel.scale == "angle" else [values]:
-                axes.plot(times, line, color=colour, linewidth=1.4)
+                axes.plot(times, line, color=color, linewidth=1.4)
     finish(left, f"the first {len(shown)} of {len(observations):,} flights")
     finish(upper, successes(found))
     finish(lower)
@@ -50,12 +47,12 @@ def figure(task: Task, observations: np.ndarray) -> Figure:
 def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None:
     """Paths of `shown` [few, K + 1, 18] from above; the triangle at a start points up or down like body z."""
     reward, reach = task.evaluation.reward, 0.0
-    for colour, path in zip(COLOURS, shown[:, :, 9:11], strict=False):
-        axes.plot(*path.T, color=colour, linewidth=1.4)
+    for color, path in zip(COLORS, shown[:, :, 9:11], strict=False):
+        axes.plot(*path.T, color=color, linewidth=1.4)
     starts, up = shown[:, 0, 9:11], shown[:, 0, 8]  # r33: the body's z axis along the world's
     for marker, label, among in (("^", "start upright", up >= 0), ("v", "start upside down", up < 0)):
-        colours = np.array(COLOURS)[: len(among)][among]
-        axes.scatter(*starts[among].T, c=colours, marker=marker, s=90, edgecolors="white", zorder=4)
+        colors = np.array(COLORS)[: len(among)][among]
+        axes.scatter(*starts[among].T, c=colors, marker=marker, s=90, edgecolors="white", zorder=4)
         if among.any():
             axes.plot([], [], marker, color=INK, markersize=8, label=label)
     if isinstance(reward, CircleReward):
@@ -63,12 +60,13 @@ def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None
         reach = reward.radius_m
     else:
         axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="target position")
-    half = _half_width(shown[:, :, 9:11], reach, task.evaluation.start.position_m)
+    # Shows target and starts; distant parts of the paths are cut off.
+    extent = np.max(np.abs(shown[:, :, 9:11]), initial=0.0, where=np.isfinite(shown[:, :, 9:11]))
+    half = 1.12 * max(min(extent, 2.0 * (task.evaluation.start.position_m + reach)), reach, 0.1)
     axes.set(xlabel="x [m], seen from above", ylabel="y [m]", aspect="equal", xlim=(-half, half), ylim=(-half, half))
 
 
 def _circle(axes: Axes, target: CircleReward) -> None:
-    """The target circle, dashed, with its direction."""
     angle = np.linspace(0.0, 2.0 * np.pi, 181)
     x, y = target.radius_m * np.cos(angle), target.radius_m * np.sin(angle)
     axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="target circle")
@@ -78,18 +76,12 @@ def _circle(axes: Axes, target: CircleReward) -> None:
     axes.text(0, 0, f"{target.speed_m_s:g} m/s", ha="center", va="center", color=INK, fontsize=11)
 
 
-def _half_width(paths: np.ndarray, reach_m: float, start_m: float) -> float:
-    """Half the width of a window on `paths` [n, K + 1, 2] that shows target and starts; distant parts are cut off."""
-    extent = np.max(np.abs(paths), initial=0.0, where=np.isfinite(paths))
-    return 1.12 * max(min(extent, 2.0 * (start_m + reach_m)), reach_m, 0.1)
-
-
 def _phase_portrait(axes: Axes, task: PendulumTask, shown: np.ndarray) -> None:
     """Rate over angle for `shown` [few, K + 1, 3]."""
-    for colour, theta, rate in zip(COLOURS, _angle(shown), shown[:, :, 2], strict=False):
+    for color, theta, rate in zip(COLORS, _angle(shown), shown[:, :, 2], strict=False):
         for line in _turns(theta):
-            axes.plot(line, rate, color=colour, linewidth=1.4)
-        axes.plot(theta[0], rate[0], "o", color=colour, markeredgecolor="white", markersize=10, zorder=4)
+            axes.plot(line, rate, color=color, linewidth=1.4)
+        axes.plot(theta[0], rate[0], "o", color=color, markeredgecolor="white", markersize=10, zorder=4)
     axes.plot([], [], "o", color=INK, markersize=8, label="start")
     axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="upright, at rest")
     top = 1.1 * task.rod.max_rate_rad_s

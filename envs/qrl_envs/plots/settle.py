@@ -10,8 +10,7 @@ from matplotlib.ticker import MultipleLocator
 
 from qrl_envs import measures
 from qrl_envs.measures import speed_m_s, tilt_deg
-from qrl_envs.plots.frame import INK, SHADE, empty, finish, legend
-from qrl_envs.plots.measured import successes
+from qrl_envs.plots.frame import INK, SHADE, empty, finish, legend, successes
 from qrl_envs.task import QuadrotorTask
 
 TILT_EDGES_DEG = np.linspace(0.0, 180.0, 13)
@@ -22,12 +21,11 @@ MANY = 50  # failures; more are drawn with smaller crosses
 
 
 def draw(path: Path, task: QuadrotorTask, observations: np.ndarray) -> None:
-    """Save a map of the settle times of flights with `observations` [n, K + 1, 18], in SI units."""
     figure(task, observations).savefig(path, format="png")
 
 
 def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
-    """The figure of `draw`. Axes: the map, and its color bar."""
+    """Settle times of flights with `observations` [n, K + 1, 18], in SI units. Axes: the map, and its color bar."""
     found = measures.of_flights(task, observations)
     tilt, speed = tilt_deg(observations[:, 0]), speed_m_s(observations[:, 0])
     figure = empty(task, height_in=5.6)
@@ -38,16 +36,9 @@ def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:
     _map(figure, axes, cells, edges)
     failed = ~found.success
     if failed.any():
-        axes.plot(
-            tilt[failed],
-            speed[failed],
-            "x",
-            color=FAILED,
-            markersize=9 if failed.sum() <= MANY else 5,
-            markeredgewidth=2.2 if failed.sum() <= MANY else 1.2,
-            label="failed start",
-            clip_on=False,
-        )
+        size, width = (9, 2.2) if failed.sum() <= MANY else (5, 1.2)
+        crosses = {"color": FAILED, "markersize": size, "markeredgewidth": width, "clip_on": False}
+        axes.plot(tilt[failed], speed[failed], "x", label="failed start", **crosses)
     axes.fill_between([], [], color=SHADE, label=f"fewer than {MIN_FLIGHTS} flights")
     axes.set(
         xlabel="tilt at the start [°]", ylabel="speed at the start [m/s]", xlim=(0.0, 180.0), ylim=(0.0, edges[-1])
@@ -76,30 +67,22 @@ def medians(tilt: np.ndarray, speed: np.ndarray, settle_s: np.ndarray, edges: np
 
 
 def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> None:
-    """Draw the cells in color, each with its number."""
     settled = cells[np.isfinite(cells)]
     low, high = (settled.min(), settled.max()) if len(settled) else (0.0, 1.0)
     high = max(high, low + 0.1)
     shown = np.ma.masked_invalid(cells)
-    colours = axes.pcolormesh(
+    colors = axes.pcolormesh(
         TILT_EDGES_DEG, edges, shown, cmap="cividis", vmin=low, vmax=high, edgecolors="white", linewidth=0.8
     )
-    bar = figure.colorbar(colours, ax=axes, pad=0.02)
+    bar = figure.colorbar(colors, ax=axes, pad=0.02)
     bar.set_label("median time to settle [s]", fontsize=11)
     bar.ax.tick_params(labelsize=10.5)
-    for i, j in np.ndindex(cells.shape):
-        if np.isnan(cells[i, j]):
+    for (i, j), value in np.ndenumerate(cells):
+        if np.isnan(value):
             continue
-        never = np.isinf(cells[i, j])
-        dark = not never and cells[i, j] < (low + high) / 2
-        axes.text(
-            float(TILT_EDGES_DEG[j] + TILT_EDGES_DEG[j + 1]) / 2,
-            float(edges[i] + edges[i + 1]) / 2,
-            "never" if never else f"{cells[i, j]:.2g}" if cells[i, j] < 10 else f"{cells[i, j]:.0f}",
-            ha="center",
-            va="center",
-            fontsize=9.5,
-            color="white" if dark else INK,
-            zorder=5,
-            path_effects=[] if not never else [withStroke(linewidth=3, foreground="white")],  # over the crosses
-        )
+        x, y = TILT_EDGES_DEG[j : j + 2].mean(), edges[i : i + 2].mean()
+        color = "white" if value < (low + high) / 2 else INK
+        text = axes.text(x, y, f"{value:.2g}" if value < 10 else f"{value:.0f}", color=color, fontsize=9.5, zorder=5)
+        text.set(ha="center", va="center")
+        if np.isinf(value):
+            text.set(text="never", path_effects=[withStroke(linewidth=3, foreground="white")])  # over the crosses

@@ -15,7 +15,7 @@ import numpy as np
 
 from qrl_envs import io_spec, measures
 from qrl_envs.measures import Measured
-from qrl_envs.task import CircleReward, Motor, PendulumTask, QuadrotorTask, Task
+from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
 
 MAX_SAMPLES = 25_000  # of all flights together; keeps a page below 8 MB
 BLUE, ORANGE = "#0072B2", "#D55E00"  # Okabe and Ito: safe for color-blind readers
@@ -35,7 +35,7 @@ class Recording(NamedTuple):
 
 class Line(NamedTuple):
     name: str
-    colour: str
+    color: str
     values: np.ndarray  # [n, K + 1], or [n, K] if constant over a control period
     description: str = ""  # longer than the name
 
@@ -57,25 +57,19 @@ class Panel(NamedTuple):
 
 
 def page(task: Task, title: str, recording: Recording) -> str:
-    """The page's HTML for recorded flights of a task."""
     folder = resources.files("qrl_envs").joinpath("viewer")
+    data = json.dumps(_data(task, title, recording), separators=(",", ":"), allow_nan=False)
     parts = {
         "policy": html.escape(POLICY),
         "title": html.escape(title),
         "style": folder.joinpath("view.css").read_text(encoding="utf-8"),
-        "library": _library(),
-        "data": json.dumps(_data(task, title, recording), separators=(",", ":"), allow_nan=False).replace(
-            "<", "\\u003c"
-        ),
+        # A file of Plotly's Python package, which is slow to import.
+        "library": resources.files("plotly").joinpath("package_data", "plotly.min.js").read_text(encoding="utf-8"),
+        "data": data.replace("<", "\\u003c"),
         "script": '"use strict";\n' + "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in SCRIPTS),
     }
     # In one pass, so that inserted text is not searched again.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], folder.joinpath("view.html").read_text("utf-8"))
-
-
-def _library() -> str:
-    """plotly.js from Plotly's Python package, read as a file because the package is slow to import."""
-    return resources.files("plotly").joinpath("package_data", "plotly.min.js").read_text(encoding="utf-8")
 
 
 def _data(task: Task, title: str, recording: Recording) -> dict[str, Any]:
@@ -106,7 +100,7 @@ def _data(task: Task, title: str, recording: Recording) -> dict[str, Any]:
         "end_s": (samples - 1) * task.control_period_s,
         "tail_s": task.evaluation.tail_s,
         **world,
-        "panels": [_described(panel) for panel in panels],
+        "panels": [panel._asdict() | {"lines": [_described(line) for line in panel.lines]} for panel in panels],
         "flights": [
             {
                 "start": int(recording.starts[i]),
@@ -131,24 +125,18 @@ def _plain(values: np.ndarray, resolution: float) -> list[Any]:
     return plain.tolist()
 
 
-def _described(panel: Panel) -> dict[str, Any]:
-    fields = {name: value for name, value in panel._asdict().items() if name not in ("lines", "resolution")}
-    return fields | {
-        "lines": [{"name": line.name, "colour": line.colour, "description": line.description} for line in panel.lines]
-    }
+def _described(line: Line) -> dict[str, str]:
+    return {"name": line.name, "color": line.color, "description": line.description}
 
 
 def _in_units(task: Task, actions: np.ndarray) -> np.ndarray:
     """The applied thrusts [N] or torque [N m] for `actions` [..., A] in [−1, 1]."""
-    ports = io_spec.actions(task)
-    offset, scale, low, high = (
-        np.array([getattr(port, name) for port in ports]) for name in ("offset", "scale", "low", "high")
-    )
+    ports = [(port.offset, port.scale, port.low, port.high) for port in io_spec.actions(task)]
+    offset, scale, low, high = np.array(ports).T
     return np.clip(offset + scale * actions, low, high)
 
 
 def _start(task: Task, observation: np.ndarray) -> str:
-    """A short description of a start."""
     if isinstance(task, PendulumTask):
         return f"{np.degrees(np.arctan2(observation[1], observation[0])):.0f}°, {observation[2]:.1f} rad/s"
     tilt = np.degrees(np.arccos(np.clip(observation[8], -1.0, 1.0)))
@@ -173,7 +161,7 @@ def _vehicle(task: QuadrotorTask) -> dict[str, Any]:
     return {
         "vehicle": {
             "motors": [
-                {"position_m": motor.position_m, "max_N": motor.max_N, "colour": line.colour}
+                {"position_m": motor.position_m, "max_N": motor.max_N, "color": line.color}
                 for motor, line in zip(task.vehicle.motors, _motors(task), strict=True)
             ]
         },
@@ -186,20 +174,14 @@ def _vehicle(task: QuadrotorTask) -> dict[str, Any]:
 
 def _motors(task: QuadrotorTask) -> list[Line]:
     """Names, colors and places of the motors, without values: warm colors in front, darker ones on the left."""
-    return [
-        Line(f"f{i} {arrow}", colour, np.zeros(0), f"the {place} motor")
-        for i, (arrow, colour, place) in enumerate((_place(motor) for motor in task.vehicle.motors), 1)
-    ]
-
-
-def _place(motor: Motor) -> tuple[str, str, str]:
-    """Arrow from the body's center as seen from above, nose up; color; place in words."""
-    eighth = round(np.arctan2(motor.position_m[1], motor.position_m[0]) / (np.pi / 4.0)) % 8
-    # A plus frame has its motors on the axes.
-    arrow = "↑↖←↙↓↘→↗"[eighth]
-    place = ("front", "front left", "left", "rear left", "rear", "rear right", "right", "front right")[eighth]
-    colour = (FRONT[1], FRONT[0], FRONT[0], REAR[0], REAR[0], REAR[1], REAR[1], FRONT[1])[eighth]
-    return arrow, colour, place
+    lines = []
+    for i, motor in enumerate(task.vehicle.motors, 1):
+        # Eighths of a turn as seen from above, nose up; a plus frame has its motors on the axes.
+        eighth = round(np.arctan2(motor.position_m[1], motor.position_m[0]) / (np.pi / 4.0)) % 8
+        place = ("front", "front left", "left", "rear left", "rear", "rear right", "right", "front right")[eighth]
+        color = (FRONT[1], FRONT[0], FRONT[0], REAR[0], REAR[0], REAR[1], REAR[1], FRONT[1])[eighth]
+        lines.append(Line(f"f{i} {'↑↖←↙↓↘→↗'[eighth]}", color, np.zeros(0), f"the {place} motor"))
+    return lines
 
 
 def _rod(task: PendulumTask) -> dict[str, Any]:

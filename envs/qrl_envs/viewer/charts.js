@@ -44,7 +44,7 @@ function makeCharts(parent, page, jump) {
     const head = element("h2", section, "", panel.label);
     const values = panel.lines.map(line => {
       const item = element("span", head);
-      element("i", item).style.background = line.colour;
+      element("i", item).style.background = line.color;
       item.title = line.description;
       return { name: line.name, text: item.appendChild(new Text()) };
     });
@@ -66,7 +66,7 @@ function makeCharts(parent, page, jump) {
       const held = panel.held ? { shape: "hv" } : {};
       const traces = panel.lines.map((line, l) => ({
         type: "scatter", mode: "lines", x: flight.panels[p][l].map((_, k) => k * page.period_s), y: flight.panels[p][l],
-        line: { color: line.colour, width: panel.lines.length > 1 ? 1.2 : 1.7, ...held }, hoverinfo: "skip",
+        line: { color: line.color, width: panel.lines.length > 1 ? 1.2 : 1.7, ...held }, hoverinfo: "skip",
       }));
       return Plotly.react(drawing, traces, layout, { displayModeBar: false, responsive: true });
     })),

@@ -5,10 +5,10 @@ const MAGNIFICATIONS = [1, 2, 3, 5, 10, 20, 30, 50, 100, 200, 300, 500, 1000];
 const VISIBLE = 0.28; // of the scene: what the vehicle spans at least
 const BAR = 1.7; // length of a thrust bar at full thrust, in arm lengths
 
-// Triangles of one colour each. A vertex with a motor in `lifted` moves up by that motor's thrust.
+// Triangles of one color each. A vertex with a motor in `lifted` moves up by that motor's thrust.
 function mesh() {
-  const shape = { vertices: [], lifted: [], faces: [], colours: [] };
-  shape.prism = (corners, low, high, colour, motor = -1) => {
+  const shape = { vertices: [], lifted: [], faces: [], colors: [] };
+  shape.prism = (corners, low, high, color, motor = -1) => {
     const first = shape.vertices.length, n = corners.length;
     for (const [z, lifts] of [[low, -1], [high, motor]])
       for (const [x, y] of corners) { shape.vertices.push([x, y, z]); shape.lifted.push(lifts); }
@@ -17,7 +17,7 @@ function mesh() {
       shape.faces.push([a, b, b + n], [a, b + n, a + n]);
       if (i > 1) shape.faces.push([first, a - 1, a], [first + n, a - 1 + n, a + n]);
     }
-    while (shape.colours.length < shape.faces.length) shape.colours.push(colour);
+    while (shape.colors.length < shape.faces.length) shape.colors.push(color);
   };
   return shape;
 }
@@ -43,9 +43,9 @@ function vehicleShape(motors) {
   for (const [i, motor] of motors.entries()) {
     const [x, y] = motor.position_m;
     shape.prism(strip(x, y, 0.06 * arm), 0, 0.08 * arm, "#6b7278");
-    shape.prism(polygon(x, y, rotor, 20), 0.12 * arm, 0.16 * arm, motor.colour);
+    shape.prism(polygon(x, y, rotor, 20), 0.12 * arm, 0.16 * arm, motor.color);
     shape.prism(polygon(x, y, 0.012 * arm, 4), 0.16 * arm, (0.16 + BAR) * arm, "#9aa1a8"); // where full thrust is
-    shape.prism(polygon(x, y, 0.1 * arm, 6), 0.16 * arm, 0.16 * arm, motor.colour, i);
+    shape.prism(polygon(x, y, 0.1 * arm, 6), 0.16 * arm, 0.16 * arm, motor.color, i);
   }
   return { ...shape, arm, span: 2 * (arm + rotor) };
 }
@@ -73,12 +73,12 @@ function meshTrace(shape, more) {
 
 const line3d = (x, y, z, line) => ({ type: "scatter3d", mode: "lines", x, y, z, line, hoverinfo: "skip" });
 
-function arrowheads(radius, size, count, colour) { // counter-clockwise, on the circle
+function arrowheads(radius, size, count, color) { // counter-clockwise, on the circle
   const shape = mesh();
   for (let n = 0; n < count; n++) {
     const angle = 2 * Math.PI * n / count + 0.4, c = Math.cos(angle), s = Math.sin(angle);
     const place = (along, out) => [radius * c - along * s + out * c, radius * s + along * c + out * s];
-    shape.prism([place(size, 0), place(-size, 0.6 * size), place(-size, -0.6 * size)], -0.08 * size, 0.08 * size, colour);
+    shape.prism([place(size, 0), place(-size, 0.6 * size), place(-size, -0.6 * size)], -0.08 * size, 0.08 * size, color);
   }
   return shape;
 }
@@ -127,7 +127,7 @@ function vehicleScene(div, page, onCamera) {
   function traces(now) {
     const m = moving(now), [X, Y, Z] = flight.position_m, floor = Z.map(z => z === null ? null : box[2][0]);
     const all = [
-      meshTrace({ ...shape, vertices: m.x[0].map((_, i) => [m.x[0][i], m.y[0][i], m.z[0][i]]) }, { facecolor: shape.colours, lighting: light }),
+      meshTrace({ ...shape, vertices: m.x[0].map((_, i) => [m.x[0][i], m.y[0][i], m.z[0][i]]) }, { facecolor: shape.colors, lighting: light }),
       line3d(m.x[1], m.y[1], m.z[1], { color: "#0072B2", width: 5 }),
       line3d(m.x[2], m.y[2], m.z[2], { color: "#a3aab2", width: 3 }),
       line3d(m.x[3], m.y[3], m.z[3], { color: "#8a9199", width: 2, dash: "dot" }),
@@ -139,7 +139,7 @@ function vehicleScene(div, page, onCamera) {
       const turn = Array.from({ length: 145 }, (_, i) => 2 * Math.PI * i / 144);
       all.push(line3d(turn.map(a => wanted.radius_m * Math.cos(a)), turn.map(a => wanted.radius_m * Math.sin(a)), turn.map(() => 0), { color: "#007a59", width: 4, dash: "dash" }));
       const arrows = arrowheads(wanted.radius_m, 0.1 * wanted.radius_m, 4, "#007a59");
-      all.push(meshTrace(arrows, { facecolor: arrows.colours, lighting: light }));
+      all.push(meshTrace(arrows, { facecolor: arrows.colors, lighting: light }));
     } else {
       all.push({ type: "scatter3d", mode: "markers", x: [0], y: [0], z: [0], hoverinfo: "skip", marker: { color: "#007a59", size: 5, symbol: "diamond" } });
     }

@@ -39,9 +39,8 @@ def export(args: argparse.Namespace) -> int:
     for gate in gates(measured):
         console.print(f"{gate} {'ok' if gate.passed else 'FAILED'}")
     if verification.costs:
-        console.print(
-            f"{'instructions per inference':<27} {'float entry':>12} {'i16 entry':>10} {'flash':>8} {'stack':>7}"
-        )
+        heads = f"{'float entry':>12} {'i16 entry':>10} {'flash':>8} {'stack':>7}"
+        console.print(f"{'instructions per inference':<27} {heads}")
     for cost in verification.costs:
         mean, mean_i16 = cost.step[0], cost.step_i16[0]
         console.print(f"{cost.core:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {cost.flash:>6,} B {max(cost.stack):>5} B")

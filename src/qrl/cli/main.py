@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import importlib
 import json
 import os
 import sys
@@ -15,6 +16,7 @@ from typing import Annotated, Any, Literal, NoReturn, get_args, get_origin
 
 from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, print_error
 from qrl.config import FORMER_NAMES, Config, load_preset
+from qrl_envs.specfile import BadInput, read
 
 CACHE_BYTES = 2_000_000_000  # of compiled programs
 
@@ -30,7 +32,6 @@ class _Parser(argparse.ArgumentParser):
         sys.exit(WRONG_INPUT)
 
     def refuse(self, word: str) -> NoReturn:
-        """`word` is neither a flag nor an argument of this command."""
         flags = [flag for action in self._actions for flag in action.option_strings]
         close = difflib.get_close_matches(word.split("=")[0], flags, n=1) if word.startswith("-") else []
         self.error(
@@ -39,18 +40,19 @@ class _Parser(argparse.ArgumentParser):
         )
 
 
-def whole_number(text: str) -> int:
+def whole_number(text: str, least: int = 0) -> int:
     value = float(text)
-    if not (0 <= value < 2**31 and value.is_integer()):
+    if not (least <= value < 2**31 and value.is_integer()):
         raise ValueError
     return int(value)
 
 
 def count(text: str) -> int:
-    value = whole_number(text)
-    if value < 1:
-        raise ValueError
-    return value
+    return whole_number(text, least=1)
+
+
+def vectors(text: str) -> int:
+    return whole_number(text, least=500)  # fewer would leave kinds of them out
 
 
 def positive(text: str) -> float:
@@ -60,81 +62,50 @@ def positive(text: str) -> float:
     return value
 
 
-def vectors(text: str) -> int:
-    value = whole_number(text)
-    if value < 500:  # fewer would leave kinds of them out
-        raise ValueError
-    return value
-
-
 def build_parser() -> _Parser:
-    """The parser of all commands."""
     parser = _Parser(prog="qrl", description="From a task to a policy that flies from a microcontroller.")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     train = commands.add_parser("train", help="train a policy and write a run folder")
-    train.add_argument(
-        "task",
-        nargs="?",
-        help="name (see qrl tasks), .json file, or module:factory of your environment",
-        metavar="TASK",
-    )
-    train.add_argument("--seed", type=whole_number, help="first seed (default 0)", metavar="N")
-    train.add_argument("--seeds", type=count, help="number of seeds, trained in one program (default 1)", metavar="N")
-    train.add_argument("--out", type=Path, help="run folder (default runs/TASK)", metavar="FOLDER")
-    train.add_argument("--config", type=Path, help="config.json, complete or in part", metavar="FILE")
+    task = "name (see qrl tasks), .json file, or module:factory of your environment"
+    train.add_argument("task", nargs="?", metavar="TASK", help=task)
+    train.add_argument("--seed", type=whole_number, metavar="N", help="first seed (default 0)")
+    train.add_argument("--seeds", type=count, metavar="N", help="number of seeds, trained in one program (default 1)")
+    train.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default runs/TASK)")
+    train.add_argument("--config", type=Path, metavar="FILE", help="config.json, complete or in part")
     train.add_argument("--resume", action="store_true", help="resume from the run folder's last checkpoint")
-    train.add_argument("--preset", help="preset of hyperparameters, in place of the task's", metavar="NAME")
+    train.add_argument("--preset", metavar="NAME", help="preset of hyperparameters, in place of the task's")
     _add_hyperparameters(train)
 
     evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts")
-    evaluate.add_argument("run", type=Path, help="run folder", metavar="RUN")
-    evaluate.add_argument("--starts", type=count, default=1000, help="number of starts (default 1000)", metavar="N")
-    evaluate.add_argument(
-        "--off-nominal", action="store_true", help="also fly with RK4, latency, sensor noise; hover: the paper's trial"
-    )
-    evaluate.add_argument(
-        "--beside", type=Path, nargs="+", default=[], help="other runs of the same task, a column each", metavar="RUN"
-    )
-    evaluate.add_argument(
-        "--checkpoints", type=count, default=1, help="number of most recent checkpoints to fly (default 1)", metavar="K"
-    )
-
     export = commands.add_parser("export", help="write a trained policy as a C kernel, and verify it")
-    export.add_argument("run", type=Path, help="run folder", metavar="RUN")
-    export.add_argument(
-        "--starts", type=count, default=1000, help="number of starts to fly the kernel from (default 1000)", metavar="N"
-    )
-    export.add_argument(
-        "--vectors",
-        type=vectors,
-        default=2000,
-        help="test vectors per entry point (default 2000, at least 500)",
-        metavar="N",
-    )
-
     view = commands.add_parser("view", help="write flights of a trained policy as a 3D page")
-    view.add_argument("run", type=Path, help="run folder", metavar="RUN")
-    view.add_argument(
-        "--starts",
-        type=whole_number,
-        nargs="+",
-        help="indices among evaluate's 1,000 starts (default: eight, failed ones first)",
-        metavar="N",
-    )
-    view.add_argument("--out", type=Path, help="HTML file (default RUN/view.html)", metavar="FILE")
+    for command in (evaluate, export, view):
+        command.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    for command in (evaluate, export):
+        command.add_argument("--starts", type=count, default=1000, metavar="N", help="number of starts (default 1000)")
+    conditions = "also fly with RK4, latency, sensor noise; hover: the paper's trial"
+    evaluate.add_argument("--off-nominal", action="store_true", help=conditions)
+    others = "other runs of the same task, a column each"
+    evaluate.add_argument("--beside", type=Path, nargs="+", default=[], metavar="RUN", help=others)
+    recent = "number of most recent checkpoints to fly (default 1)"
+    evaluate.add_argument("--checkpoints", type=count, default=1, metavar="K", help=recent)
+    each = "test vectors per entry point (default 2000, at least 500)"
+    export.add_argument("--vectors", type=vectors, default=2000, metavar="N", help=each)
+    chosen = "indices among evaluate's 1,000 starts (default: eight, failed ones first)"
+    view.add_argument("--starts", type=whole_number, nargs="+", metavar="N", help=chosen)
+    view.add_argument("--out", type=Path, metavar="FILE", help="HTML file (default RUN/view.html)")
 
     sweep = commands.add_parser("sweep", help="train every point of a grid; rerun to resume")
-    sweep.add_argument("grid", type=Path, help="grid file, such as experiments/grids/pendulum_lr.json", metavar="GRID")
-    sweep.add_argument("--out", type=Path, help="folder of the results (default runs/GRID)", metavar="FOLDER")
-    sweep.add_argument(
-        "--memory-gb", type=positive, help="memory of the members (default: half of the devices')", metavar="GB"
-    )
+    sweep.add_argument("grid", type=Path, metavar="GRID", help="grid file, such as experiments/grids/pendulum_lr.json")
+    sweep.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the results (default runs/GRID)")
+    memory = "memory of the members (default: half of the devices')"
+    sweep.add_argument("--memory-gb", type=positive, metavar="GB", help=memory)
     for command, what in ((train, "one run"), (sweep, "one sweep")):
         hosts = command.add_argument_group(f"several processes for {what}", "defaults: JAX's or SLURM's variables")
-        hosts.add_argument("--process-id", type=whole_number, help="index of this process, from 0", metavar="I")
-        hosts.add_argument("--processes", type=count, help="number of processes", metavar="N")
-        hosts.add_argument("--coordinator", help="address of process 0", metavar="HOST:PORT")
+        hosts.add_argument("--process-id", type=whole_number, metavar="I", help="index of this process, from 0")
+        hosts.add_argument("--processes", type=count, metavar="N", help="number of processes")
+        hosts.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
 
     commands.add_parser("tasks", help="list the tasks that can be trained")
     return parser
@@ -146,16 +117,11 @@ def _add_hyperparameters(train: argparse.ArgumentParser) -> None:
         "hyperparameters", "Defaults are of the default preset; a task's preset sets others."
     )
     defaults = load_preset("default")
-    former: dict[str, list[str]] = {}
-    for old, new in FORMER_NAMES.items():
-        former.setdefault(new, []).append(old)
     for name, field in Config.model_fields.items():
         default = json.dumps(defaults[name])
         text = f"{field.description} (default {default})".replace("%", "%%")
-        unset: Any = {"dest": f"learner.{name}", "default": argparse.SUPPRESS}
-        group.add_argument(_flag(name), help=text, metavar=_metavar(field.annotation), **unset)
-        for old in former.get(name, ()):
-            group.add_argument(_flag(old), help=argparse.SUPPRESS, action=_FormerName, now=_flag(name), **unset)
+        kind, dest = _metavar(field.annotation), f"learner.{name}"
+        group.add_argument(_flag(name), dest=dest, default=argparse.SUPPRESS, metavar=kind, help=text)
 
 
 def _flag(name: str) -> str:
@@ -174,21 +140,16 @@ def _metavar(annotation: Any) -> str:
     return {int: "INT", float: "FLOAT", bool: "true|false"}.get(annotation, "VALUE")
 
 
-class _FormerName(argparse.Action):
-    """A flag of before, which says its name of today."""
-
-    def __init__(self, *args: Any, now: str, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.now = now
-
-    def __call__(self, parser: Any, namespace: argparse.Namespace, value: Any, option: str | None = None) -> None:
-        print(f"note: {option} is now {self.now}", flush=True)
-        setattr(namespace, self.dest, value)
-
-
 def _parse(argv: list[str] | None) -> argparse.Namespace:
+    words = list(sys.argv[1:] if argv is None else argv)
+    former = {_flag(old): _flag(name) for old, name in FORMER_NAMES.items()} if words[:1] == ["train"] else {}
+    for i, word in enumerate(words):
+        flag, equals, value = word.partition("=")
+        if flag in former:
+            print(f"note: {flag} is now {former[flag]}", flush=True)
+            words[i] = former[flag] + equals + value
     parser = build_parser()
-    args, unknown = parser.parse_known_args(argv)
+    args, unknown = parser.parse_known_args(words)
     if unknown:
         commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
         commands.choices[args.command].refuse(unknown[0])
@@ -230,12 +191,25 @@ def main(argv: list[str] | None = None) -> int:
     subject = {"train": "task", "sweep": "grid"}.get(args.command, "run")
     if args.command != "tasks":
         print(f"qrl {args.command} {getattr(args, subject) or args.config or ''}: loading JAX", flush=True)
+    _note_former_names(getattr(args, "config", None) or getattr(args, "grid", None))
     try:
         configure_jax()
     except KeyboardInterrupt:
         print_error("interrupted")
         return FAILED
     return _run(args)
+
+
+def _note_former_names(path: Path | None) -> None:
+    """The note of a former flag, for the hyperparameters of CONFIG or GRID; the command says if the file is wrong."""
+    with suppress(BadInput):
+        data = read(path) if path else {}
+        inside = [data.get(key) for key in ("learner", "fixed", "axes")]
+        for values in inside:
+            if isinstance(values, dict):
+                for name in values.keys() & FORMER_NAMES.keys():
+                    print(f"note: {path}: {name} is now {FORMER_NAMES[name]}", flush=True)
+                inside += values.values()  # named settings
 
 
 def _run(args: argparse.Namespace) -> int:
@@ -246,7 +220,6 @@ def _run(args: argparse.Namespace) -> int:
     from qrl.export.targets import VerificationFailed
     from qrl.runs.integrity import IncompatibleCheckpoint
     from qrl.training.driver import NotFinite
-    from qrl_envs.specfile import BadInput
 
     code = FAILED
     try:
@@ -257,12 +230,10 @@ def _run(args: argparse.Namespace) -> int:
     except IncompatibleCheckpoint as error:
         print_error(str(error))
         code = WRONG_INPUT
-    except (NotFinite, AccumulatorOverflow, VerificationFailed) as error:
-        print_error(str(error))
     except OSError as error:
         print_error(f"{error.filename}: {error.strerror}" if error.filename else str(error))
-    except jax.errors.JaxRuntimeError as error:  # out of memory, above all
-        print_error(str(error))
+    except (NotFinite, AccumulatorOverflow, VerificationFailed, jax.errors.JaxRuntimeError) as error:
+        print_error(str(error))  # of JAX: out of memory, above all
     except KeyboardInterrupt:
         print_error("interrupted")
     except Exception as error:
@@ -280,20 +251,9 @@ def _run(args: argparse.Namespace) -> int:
 
 def _command(name: str) -> Callable[[argparse.Namespace], int]:
     """The command of that name, imported lazily: none waits for what another needs."""
-    match name:
-        case "train":
-            from qrl.cli.train import train as command
-        case "evaluate":
-            from qrl.cli.evaluate import evaluate as command
-        case "export":
-            from qrl.cli.export import export as command
-        case "view":
-            from qrl.cli.view import view as command
-        case "sweep":
-            from qrl.cli.sweep import sweep as command
-        case _:
-            return _list_tasks
-    return command
+    if name == "tasks":
+        return _list_tasks
+    return getattr(importlib.import_module(f"qrl.cli.{name}"), name)
 
 
 def _list_tasks(_: argparse.Namespace) -> int:

@@ -16,7 +16,7 @@ from qrl.runs import files, record
 from qrl.sweep import grid as grids
 from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import Grid
-from qrl.sweep.runner import ChunkDone, Compiling, Group, Member
+from qrl.sweep.runner import ChunkDone, Compiling, Group, Member, Progress
 from qrl.training import devices, multihost
 from qrl.training.multihost import Process
 from qrl.training.state import member_inputs
@@ -35,43 +35,31 @@ def sweep(args: argparse.Namespace) -> int:
     multihost.join(process)
     budget = given or devices.memory_bytes()
     out: Path = args.out or Path("runs") / args.grid.stem
-    exists = _holds_sweep(out, grid)
-    if exists and (out / "summary.json").exists() and (out / "sweep.png").exists():
+    if _holds_sweep(out, grid) and (out / "summary.json").exists() and (out / "sweep.png").exists():
         console.print(f"{out}: complete already; nothing to do")
         return _exit_code(out)
     groups = _groups(grid, process, budget, args.grid)
     out.mkdir(parents=True, exist_ok=True)
     busy = f"{out}: in use by another sweep; wait for its end, or give another OUT"
     with files.locked(out / f"process-{process.number}.lock", busy):
-        return _work(args, start_time, process, budget, grid, groups, out)
-
-
-def _work(
-    args: argparse.Namespace,
-    start_time: float,
-    process: Process,
-    budget: float,
-    grid: Grid,
-    groups: list[Group],
-    out: Path,
-) -> int:
-    """With the folder locked: train the remaining members, and write the results."""
-    _write_grid(out, grid, process, _holds_sweep(out, grid))
-    total = len(grid.points) * len(grid.seeds)
-    console.print(
-        f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
-        f" program{'s' * (len(groups) > 1)}, {len(devices.workers())} workers on {jax.local_devices()[0].platform}"
-        f" -> {out}"
-    )
-    with stop_requested("stopping: finished chunks are kept") as stopped:
-        _train_groups(groups, out, budget, stopped)
-        found = _all_results(out, total, process, stopped)
-    if found is None:
-        console.print("stopped; rerun the same command to resume")
-        return FAILED
-    if process.number:
-        return DONE  # process 0 writes the results
-    return _finish(out, grid, found, args.grid.stem, time.perf_counter() - start_time)
+        if not _holds_sweep(out, grid) and process.number == 0:
+            here = {"versions": record.versions(), "devices": devices.device_names()}
+            files.write_json(out / "grid.json", {**grid.record, **here})
+        total = len(grid.points) * len(grid.seeds)
+        console.print(
+            f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
+            f" program{'s' * (len(groups) > 1)}, {len(devices.workers())} workers on {jax.local_devices()[0].platform}"
+            f" -> {out}"
+        )
+        with stop_requested("stopping: finished chunks are kept") as stopped:
+            _train_groups(groups, out, budget, stopped)
+            found = _all_results(out, total, process, stopped)
+        if found is None:
+            console.print("stopped; rerun the same command to resume")
+            return FAILED
+        if process.number:
+            return DONE  # process 0 writes the results
+        return _finish(out, grid, found, args.grid.stem, time.perf_counter() - start_time)
 
 
 def _holds_sweep(out: Path, grid: Grid) -> bool:
@@ -96,12 +84,12 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
         first = grid.points[indices[0]]
         env = tasks.environment(first.task)
         tasks.check(env, first.learner, f"{path}: at {grids.describe(first.coordinates)}")
-        points = {i: member_inputs(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
+        inputs = {i: member_inputs(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
         members = [
-            Member(i * len(grid.seeds) + j, seed, points[i]) for i in indices for j, seed in enumerate(grid.seeds)
+            Member(i * len(grid.seeds) + j, seed, inputs[i]) for i in indices for j, seed in enumerate(grid.seeds)
         ]
         trainer = make_trainer(env, first.learner)
-        each, workers = runner.member_bytes(trainer, members[0].point), len(devices.workers())
+        each, workers = runner.member_bytes(trainer, members[0].inputs), len(devices.workers())
         if not runner.chunk_members(len(members), each, budget, workers):
             raise BadInput(
                 f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
@@ -112,22 +100,15 @@ def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Gro
     return groups
 
 
-def _write_grid(out: Path, grid: Grid, process: Process, exists: bool) -> None:
-    if not exists and process.number == 0:
-        here = {"versions": record.versions(), "devices": devices.device_names()}
-        files.write_json(out / "grid.json", {**grid.record, **here})
-
-
 def _train_groups(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
     """Train every group with progress on the screen: a line for each chunk, and a bar."""
-    work = sum(len(group.members) * group.steps for group in groups)
     kept = runner.finished(
         out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are trained again")
     )
-    mine = [group.steps for group in groups for member in group.members if member.number in kept]
+    mine = [group.steps for group in groups for member in group.members if member.index in kept]
+    work, total = sum(len(group.members) * group.steps for group in groups), sum(len(group.members) for group in groups)
     done = before = sum(mine)
-    count, total = len(mine), sum(len(group.members) for group in groups)
-    start_time = time.perf_counter()
+    count, start_time = len(mine), time.perf_counter()
 
     def eta(now: float) -> str:
         spent = time.perf_counter() - start_time
@@ -135,27 +116,25 @@ def _train_groups(groups: list[Group], out: Path, budget: float, stopped: Callab
 
     with progress_bar(work, done) as update:
         for number, group in enumerate(groups):
-            under_way: dict[int, int] = {}
+            under_way: dict[int, int] = {}  # steps of chunks
             for event in runner.run(group, devices.workers(), budget, out / "chunks", stopped):
-                if isinstance(event, Compiling):
-                    console.print(f"compiling program {number + 1} of {len(groups)}, {event.chunk} members at once")
-                elif isinstance(event, ChunkDone):
-                    under_way.pop(event.worker, None)
-                    done += len(event.results) * group.steps
-                    count += len(event.results)
-                    console.print(_line(event, count, total, eta(done + sum(under_way.values()))))
-                else:
-                    under_way[event.worker] = event.env_steps
-                    now = done + sum(under_way.values())
-                    update(now, f"{count} of {total} members, ETA {eta(now)}")
-
-
-def _line(event: ChunkDone, count: int, total: int, eta: str) -> str:
-    num_diverged = sum(bool(result.diverged) for result in event.results.values())
-    return (
-        f"{count:>6} of {total} members done, {clock(event.seconds)} for the last {len(event.results)},"
-        f" ETA {eta}{f'; {num_diverged} diverged' if num_diverged else ''}"
-    )
+                match event:
+                    case Compiling():
+                        console.print(f"compiling program {number + 1} of {len(groups)}, {event.size} members at once")
+                    case Progress():
+                        under_way[event.chunk] = event.env_steps
+                        now = done + sum(under_way.values())
+                        update(now, f"{count} of {total} members, ETA {eta(now)}")
+                    case ChunkDone():
+                        under_way.pop(event.chunk, None)
+                        done += len(event.results) * group.steps
+                        count += len(event.results)
+                        diverged = sum(bool(result.diverged) for result in event.results.values())
+                        console.print(
+                            f"{count:>6} of {total} members done, {clock(event.seconds)} for the last"
+                            f" {len(event.results)}, ETA {eta(done + sum(under_way.values()))}"
+                            f"{f'; {diverged} diverged' if diverged else ''}"
+                        )
 
 
 def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
@@ -184,7 +163,6 @@ def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: fl
 
 
 def _exit_code(out: Path) -> int:
-    """The exit code of a finished sweep."""
     if (out / "best.json").exists():
         return DONE
     print_error(f"{out}: every member diverged; see results.csv")
@@ -194,7 +172,7 @@ def _exit_code(out: Path) -> int:
 def _print_table(summaries: list[results.Summary], seeds: int) -> None:
     """The best points, best first: median and quartiles over seeds."""
     rows = [
-        [*(_cell(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
+        [*(grids.text(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
         + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
         for f in results.ranked(summaries)[:SHOWN]
     ]
@@ -204,10 +182,6 @@ def _print_table(summaries: list[results.Summary], seeds: int) -> None:
         console.print("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())
     if len(summaries) > SHOWN:
         console.print(f"… and {len(summaries) - SHOWN:,} more in summary.json")
-
-
-def _cell(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _spread(quartiles: dict[str, float], form: str) -> str:

@@ -37,7 +37,6 @@ def off_nominal(title: str, result: dict[str, Any]) -> None:
 
 
 def failures(name: str, result: dict[str, Any]) -> None:
-    """The number of failed starts, and the first of them."""
     listed = result["failures"]
     console.print(f"{name}: {result['failed']:,} of {result['starts']:,} starts failed", end="")
     if not listed:

@@ -14,7 +14,6 @@ console = Console(highlight=False, markup=False, soft_wrap=True)
 
 
 def print_error(message: str) -> None:
-    """One line on stderr."""
     print(f"qrl: {' '.join(message.split())}", file=sys.stderr)
 
 
@@ -50,6 +49,5 @@ def stop_requested(message: str = "stopping: saving first") -> Iterator[Callable
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds."""
     minutes, seconds = divmod(round(seconds), 60)
     return f"{minutes}:{seconds:02d}"

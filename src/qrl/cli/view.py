@@ -26,7 +26,9 @@ def view(args: argparse.Namespace) -> int:
     """Fly a few starts of `qrl evaluate` with every seed of a run; write view.html to each folder."""
     config = tasks.load_run_config(args.run)
     if not config.task.spec:
-        raise BadInput(f"{args.run}: expected a run of one of our own tasks, found Brax's '{config.task.name}'")
+        raise BadInput(
+            f"{args.run}: expected a run of one of our own tasks, found another environment, '{config.task.name}'"
+        )
     folders = record.member_folders(args.run, config)
     if args.out and len(folders) > 1:
         raise BadInput(f"{args.run}: --out: holds {config.seeds} seeds; name one of them, such as {folders[0]}")
@@ -47,7 +49,6 @@ def view(args: argparse.Namespace) -> int:
 
 
 def _requested(starts: list[int]) -> list[int]:
-    """The starts of --starts, without duplicates."""
     if max(starts) >= STARTS:
         raise BadInput(f"--starts: expected indices below {STARTS:,}, found {max(starts)}")
     unique = list(dict.fromkeys(starts))

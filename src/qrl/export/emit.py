@@ -5,8 +5,7 @@ import io
 import json
 import re
 from collections.abc import Iterable
-from importlib import resources
-from importlib.resources.abc import Traversable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,35 +17,37 @@ from qrl.export.policy import Policy
 from qrl.export.vectors import EMBEDDED, Vectors
 
 FORMAT = 1
+TEMPLATES = Path(__file__).parent / "templates"
 FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"
 
 
 def files(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
     """All emitted files except the report: path in the export folder -> text."""
     values = _values(policy, kernel, golden)
-    emitted = {path: _filled(text, values) for path, text in _templates(resources.files("qrl.export") / "templates")}
+    templates = {str(path.relative_to(TEMPLATES)): path for path in TEMPLATES.rglob("*") if path.is_file()}
+    emitted = {
+        name: re.sub(r"@(\w+)@", lambda match: values[match[1]], path.read_text(encoding="utf-8"))
+        for name, path in templates.items()
+    }
     emitted["manifest.json"] = json.dumps(manifest(policy, kernel), indent=2) + "\n"
     emitted["golden.csv"] = _golden_csv(policy, golden)
     return emitted
 
 
-def _templates(folder: Traversable, path: str = "") -> Iterable[tuple[str, str]]:
-    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        name = f"{path}{entry.name}"
-        if entry.is_dir():
-            yield from _templates(entry, f"{name}/")
-        else:
-            yield name, entry.read_text(encoding="utf-8")
-
-
-def _filled(text: str, values: dict[str, str]) -> str:
-    """`text` with every @placeholder@ replaced; KeyError if one is unknown."""
-    return re.sub(r"@(\w+)@", lambda match: values[match[1]], text)
-
-
 def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
     """manifest.json: ports with names, units, frames, ranges and steps, and where the policy comes from."""
-    act_lsb, run = kernel.act_lsb.astype(float), policy.provenance
+    run = policy.provenance
+    obs = [
+        {"name": o.name, "unit": o.unit, "frame": o.frame, "range": limits, "steps": [int(low), int(high)], "lsb": lsb}
+        for o, limits, low, high, lsb in zip(
+            policy.observations, _obs_ranges(kernel), kernel.obs_min, kernel.obs_max, kernel.lsb.tolist(), strict=True
+        )
+    ]
+    act = []
+    for a, limits, lsb in zip(policy.actions, _act_ranges(kernel), kernel.act_lsb.tolist(), strict=True):
+        motor = {} if a.position_m is None else {"position_m": list(a.position_m), "spin": a.spin}
+        port = {"name": a.name, "unit": a.unit, "frame": a.frame, **motor, "range": limits, "lsb": lsb}
+        act.append(port | {"safe": float(np.float32(a.safe))})
     return {
         "format": FORMAT,
         "task": run.task,
@@ -55,38 +56,27 @@ def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
         "seed": run.seed,
         "env_steps": run.env_steps,
         "control_period_s": policy.control_period_s,
-        "network": [len(policy.observations), *(len(layer.bias) for layer in kernel.layers)],
+        "network": kernel.widths,
         "activation": kernel.activation,
-        "obs": [
-            {
-                "name": o.name,
-                "unit": o.unit,
-                "frame": o.frame,
-                "range": [float(bound[i] * kernel.lsb[i]) for bound in (kernel.obs_min, kernel.obs_max)],
-                "steps": [int(kernel.obs_min[i]), int(kernel.obs_max[i])],
-                "lsb": float(kernel.lsb[i]),
-            }
-            for i, o in enumerate(policy.observations)
-        ],
-        "act": [
-            {"name": a.name, "unit": a.unit, "frame": a.frame}
-            | ({} if a.position_m is None else {"position_m": list(a.position_m), "spin": a.spin})
-            | {
-                "range": [kernel.act_min[i] * act_lsb[i], kernel.act_max[i] * act_lsb[i]],
-                "lsb": act_lsb[i],
-                "safe": float(kernel.act_safe[i]),
-            }
-            for i, a in enumerate(policy.actions)
-        ],
+        "obs": obs,
+        "act": act,
     }
+
+
+def _obs_ranges(kernel: Kernel) -> list[list[float]]:
+    return (np.stack([kernel.obs_min, kernel.obs_max], axis=1) * kernel.lsb[:, None]).tolist()
+
+
+def _act_ranges(kernel: Kernel) -> list[list[float]]:
+    return (np.stack([kernel.act_min, kernel.act_max], axis=1) * kernel.act_lsb[:, None].astype(float)).tolist()
 
 
 def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
     """Values of the templates' @placeholders@."""
-    run = policy.provenance
+    run, network = policy.provenance, "-".join(map(str, kernel.widths))
     banner = [
         f" * {run.task}: {run.description}.",
-        f" * A policy trained by qrl, exported as an integer network {_network(policy)} ({kernel.activation}).",
+        f" * A policy trained by qrl, exported as an integer network {network} ({kernel.activation}).",
         f" * Run {run.run}, seed {run.seed}, {run.env_steps:,} environment steps, commit {run.commit}.",
     ]
     return {
@@ -111,14 +101,10 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
         "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
-        "widest": str(max(_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers))),
+        "widest": str(max(map(_padded, kernel.widths))),
         "tanh": str(int(kernel.activation == "tanh")),
         "tables": _tables(kernel, golden),
     }
-
-
-def _network(policy: Policy) -> str:
-    return "-".join(str(n) for n in (len(policy.observations), *(len(bias) for _, bias in policy.layers)))
 
 
 def _comment_safe(text: str) -> str:
@@ -128,22 +114,17 @@ def _comment_safe(text: str) -> str:
 
 
 def _port_lines(policy: Policy, kernel: Kernel) -> Iterable[str]:
-    lows, highs, act_lsb = kernel.obs_min * kernel.lsb, kernel.obs_max * kernel.lsb, kernel.act_lsb.astype(float)
-    yield "obs  name        unit    range                  lsb        meaning"
-    for i, o in enumerate(policy.observations):
-        yield f"{i:>3}  {o.name:<11} {o.unit:<7} {lows[i]:>9.4g} .. {highs[i]:<9.4g} {kernel.lsb[i]:<10.4g} {o.frame}"
+    heading = "name        unit    range                  lsb        meaning"
+    yield f"obs  {heading}"
+    for i, (o, (low, high), lsb) in enumerate(zip(policy.observations, _obs_ranges(kernel), kernel.lsb, strict=True)):
+        yield f"{i:>3}  {o.name:<11} {o.unit:<7} {low:>9.4g} .. {high:<9.4g} {lsb:<10.4g} {o.frame}"
     yield ""
-    yield "act  name        unit    range                  lsb        meaning"
-    for i, a in enumerate(policy.actions):
-        low, high = kernel.act_min[i] * act_lsb[i], kernel.act_max[i] * act_lsb[i]
-        where = (
-            "" if a.position_m is None else f"; motor at x {a.position_m[0]:+g} m, y {a.position_m[1]:+g} m of the body"
-        )
-        turn = {None: "", 1: ", spin +1: reaction torque positive about body z", -1: ", spin -1: negative"}[a.spin]
-        yield (
-            f"{i:>3}  {a.name:<11} {a.unit:<7} {low:>9.4g} .. {high:<9.4g} {act_lsb[i]:<10.4g} {a.frame}{where}{turn};"
-            f" safe {a.safe:.4g}"
-        )
+    yield f"act  {heading}"
+    turns = {None: "", 1: ", spin +1: reaction torque positive about body z", -1: ", spin -1: negative"}
+    for i, (a, (low, high), lsb) in enumerate(zip(policy.actions, _act_ranges(kernel), kernel.act_lsb, strict=True)):
+        place = a.position_m and f"; motor at x {a.position_m[0]:+g} m, y {a.position_m[1]:+g} m of the body"
+        meaning = f"{a.frame}{place or ''}{turns[a.spin]}; safe {a.safe:.4g}"
+        yield f"{i:>3}  {a.name:<11} {a.unit:<7} {low:>9.4g} .. {high:<9.4g} {float(lsb):<10.4g} {meaning}"
 
 
 # -- C tables ------------------------------------------------------------------------------------------------
@@ -154,7 +135,7 @@ def _padded(n: int) -> int:
 
 
 def _tables(kernel: Kernel, golden: Vectors) -> str:
-    sizes = [_padded(len(kernel.lsb)), *(_padded(len(layer.bias)) for layer in kernel.layers)]
+    sizes = list(map(_padded, kernel.widths))
     columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max
     inputs = (f"{{{s}u, {e}, {low}, {high}}}" for s, e, low, high in zip(*columns, strict=True))
     parts = [
@@ -190,16 +171,8 @@ def _layer_tables(index: int, layer: Dense) -> str:
             f"static const union {{\n    weight w[{weight.size}];\n    int32_t aligned;\n}} weights_{index} = {{{{",
             *_lines(fours, 4),
             "}};",
-            _array(
-                f"int32_t biases_{index}[{len(bias)}]",
-                (f"BIAS({b}, {s})" for b, s in zip(bias, sums, strict=True)),
-                5,
-            ),
-            _array(
-                f"factors factors_{index}[]",
-                (f"M2({a}, {b})" for a, b in multiplier.reshape(-1, 2)),
-                8,
-            ),
+            _array(f"int32_t biases_{index}[{len(bias)}]", map("BIAS({}, {})".format, bias, sums), 5),
+            _array(f"factors factors_{index}[]", (f"M2({a}, {b})" for a, b in multiplier.reshape(-1, 2)), 8),
         ]
     )
 
@@ -222,8 +195,7 @@ def _lines(values: Iterable[str], columns: int) -> list[str]:
 
 def _float(value: np.floating) -> str:
     """A C float literal with exactly these bits."""
-    text = np.format_float_scientific(np.float32(value), unique=True)
-    return f"{text}F"
+    return f"{np.format_float_scientific(np.float32(value), unique=True)}F"
 
 
 def _floats(values: NDArray[np.float32]) -> str:
@@ -238,14 +210,7 @@ def _golden_csv(policy: Policy, golden: Vectors) -> str:
     acts = [f"{port.name}_lsb" for port in policy.actions]
     writer.writerow([*names, *(f"{name}_lsb" for name in names), "status", "status_i16", *acts])
     outputs = golden.outputs
-    for i in range(len(golden.obs)):
-        writer.writerow(
-            [
-                *map(str, golden.obs[i]),
-                *golden.obs_i16[i],
-                outputs.status[i],
-                outputs.status_i16[i],
-                *outputs.act_i16[i],
-            ]
-        )
+    columns = golden.obs, golden.obs_i16, outputs.status, outputs.status_i16, outputs.act_i16
+    for obs, obs_i16, status, status_i16, act_i16 in zip(*columns, strict=True):
+        writer.writerow([*map(str, obs), *obs_i16, status, status_i16, *act_i16])
     return out.getvalue()

@@ -41,6 +41,11 @@ class Kernel:
         """The step of each observation, in its unit; [F]."""
         return 2.0 ** (self.exponent - 142) / self.scale
 
+    @property
+    def widths(self) -> list[int]:
+        """Numbers of observations, of each hidden layer's units and of actions."""
+        return [len(self.scale), *(len(layer.bias) for layer in self.layers)]
+
 
 class AccumulatorOverflow(ArithmeticError):
     """An accumulator or a field of the kernel could exceed its type in C."""
@@ -60,7 +65,6 @@ def accumulator_bound(kernel: Kernel) -> int:
 
 
 def _check_fields(kernel: Kernel) -> None:
-    """Raise AccumulatorOverflow if a number does not fit its type in C."""
     ranges = [
         ("an input's scale", kernel.scale, 2**15, 2**16 - 1),
         ("an input's exponent", kernel.exponent, -(2**15), INT16),

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class ObservationSpec:
-    """One number that the policy observes."""
-
     name: str
     unit: str
     frame: str
@@ -41,8 +39,6 @@ class ActionSpec:
 
 @dataclass(frozen=True)
 class Provenance:
-    """The run that trained a policy."""
-
     run: str
     task: str
     description: str

@@ -14,8 +14,6 @@ from qrl.export.verify import VerificationReport
 
 
 class FlightStats(NamedTuple):
-    """Statistics of flights from many starts."""
-
     summary: dict[str, float]  # as in evaluation.json
     success: NDArray[np.bool_] | None  # [starts]; None if the task does not measure it
     jitter: float  # mean change of an action from step to step over the tail, as a fraction of full scale
@@ -24,8 +22,6 @@ class FlightStats(NamedTuple):
 
 @dataclass(frozen=True)
 class Gate:
-    """One limit, passed if measured <= limit."""
-
     name: str
     measured: float
     limit: float
@@ -44,8 +40,6 @@ class Gate:
 
 @dataclass(frozen=True)
 class Measured:
-    """All that an export measured."""
-
     accuracy: Accuracy
     naive: Accuracy
     float_flights: FlightStats
@@ -75,12 +69,10 @@ def gates(measured: Measured) -> list[Gate]:
 
 
 def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
-    """report.md."""
     found = gates(measured)
     failed = [gate for gate in found if not gate.passed]
-    network = "-".join(str(n) for n in (len(kernel.lsb), *(len(layer.bias) for layer in kernel.layers)))
     run = policy.provenance
-    lines = [f"# {run.task}: {network} {kernel.activation}, int8", ""]
+    lines = [f"# {run.task}: {'-'.join(map(str, kernel.widths))} {kernel.activation}, int8", ""]
     lines += [f"> **Warning: failed: {gate}.**" for gate in failed]
     if failed:
         lines += ["> The C matches the integer reference; the integer policy differs this much from the float one.", ""]
@@ -91,7 +83,7 @@ def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
         *_verification(kernel, measured.verification),
         *_accuracy(measured, found),
         *_costs(policy, measured),
-        *_usage(),
+        USAGE,
     ]
     return "\n".join(lines)
 
@@ -168,13 +160,14 @@ def _costs(policy: Policy, measured: Measured) -> Iterable[str]:
     yield f"\nThe policy needs {1 / policy.control_period_s:,.0f} Hz.\n"
 
 
-def _usage() -> Iterable[str]:
-    yield "## Use\n"
-    yield (
-        "Add `qrl_policy.h` and `qrl_policy.c` to the firmware: C99, no libm, no heap, no state. The header documents"
-        " every input and output: order, unit, frame, range, motor positions and spins.\n\n"
-        "- `examples/bare_metal`: `make` runs it on the host; `CMakeLists.txt` for CMake.\n"
-        "- Arduino: this folder is a library; copy it to `libraries/qrl_policy`. PlatformIO: to `lib/qrl_policy`.\n"
-        "- Call `qrl_policy_selftest()` at boot and do not fly unless it returns 0.\n"
-        "- `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.\n"
-    )
+USAGE = """\
+## Use
+
+Add `qrl_policy.h` and `qrl_policy.c` to the firmware: C99, no libm, no heap, no state. The header documents\
+ every input and output: order, unit, frame, range, motor positions and spins.
+
+- `examples/bare_metal`: `make` runs it on the host; `CMakeLists.txt` for CMake.
+- Arduino: this folder is a library; copy it to `libraries/qrl_policy`. PlatformIO: to `lib/qrl_policy`.
+- Call `qrl_policy_selftest()` at boot and do not fly unless it returns 0.
+- `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.
+"""

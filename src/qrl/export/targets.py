@@ -22,19 +22,10 @@ Floats = np.ndarray[tuple[int, ...], np.dtype[np.floating]]
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.integer]]
 
 SOURCES = Path(__file__).parent / "harness"
-STRICT = (
-    "-std=c99",
-    "-pedantic",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-Wconversion",
-    "-Wsign-conversion",
-    "-Wshadow",
-    "-O2",
-)
+WARNINGS = ("-Wall", "-Wextra", "-Werror")
+STRICT = ("-std=c99", "-pedantic", *WARNINGS, "-Wconversion", "-Wsign-conversion", "-Wshadow", "-O2")
 FIRMWARE = ("-std=gnu11", "-O3", "-ffp-contract=fast", "-ffast-math")  # the least careful build
-RELEASE = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror")  # for sizes and instruction counts
+RELEASE = ("-std=c99", "-O2", *WARNINGS)  # for sizes and instruction counts
 TIMEOUT_S = 60.0
 CLOCK_ERROR = 8  # instructions, per measured call: two rounds of the loops around it
 KNOWN_ROUNDS = (1000, 12345)  # of a loop of known length, timed in each run
@@ -92,26 +83,18 @@ def host_compiler() -> str | None:
 
 def missing_tools() -> list[str]:
     """Tools that `run_core` and `size` need and this machine does not have."""
-    missing = [
-        tool for tool in ("arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm") if not shutil.which(tool)
-    ]
+    tools = "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"
+    missing = [tool for tool in tools if not shutil.which(tool)]
     if "arm-none-eabi-gcc" not in missing:
-        # The compiler names a library that it does not have without a folder.
-        library = subprocess.run(
-            ["arm-none-eabi-gcc", "-print-file-name=libc.a"], capture_output=True, text=True, check=False
-        ).stdout.strip()
-        missing += [] if Path(library).is_absolute() else ["newlib (libnewlib-arm-none-eabi)"]
+        command = ["arm-none-eabi-gcc", "-print-file-name=libc.a"]
+        library = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+        if not Path(library).is_absolute():  # the compiler names a library that it does not have without a folder
+            missing.append("newlib (libnewlib-arm-none-eabi)")
     return missing
 
 
 def run_host(
-    kernel: Path,
-    work: Path,
-    flags: Sequence[str],
-    obs_f32: Floats,
-    obs_i16: Ints,
-    libraries: Sequence[str] = (),
-    timeout_s: float = TIMEOUT_S,
+    kernel: Path, work: Path, flags: Sequence[str], obs_f32: Floats, obs_i16: Ints, libraries: Sequence[str] = ()
 ) -> Outputs:
     """Outputs of `kernel` (a folder) on this machine for observations [N, O] and [M, O], compiled with `flags`."""
     compiler = host_compiler()
@@ -119,7 +102,7 @@ def run_host(
         raise VerificationFailed("no C compiler on this machine (cc, gcc or clang)")
     folder = _folder(work, "host", obs_f32, obs_i16)
     _build([compiler, *flags, *_sources(kernel, "host.c"), *libraries, "-o", "kernel"], folder, "host")
-    output = _run([str(folder.resolve() / "kernel")], folder, "host", timeout_s)
+    output = _run([str(folder.resolve() / "kernel")], folder, "host")
     return _read(folder, "host", output, obs_f32, obs_i16)[0]
 
 
@@ -131,7 +114,6 @@ def run_core(
     obs_f32: Floats,
     obs_i16: Ints,
     libraries: Sequence[str] = (),
-    timeout_s: float = TIMEOUT_S,
 ) -> tuple[Outputs, Counts]:
     """Outputs and costs of `kernel` on `core`; linked with libc, libgcc and `libraries` only."""
     folder = _folder(work, core.name, obs_f32, obs_i16)
@@ -139,36 +121,30 @@ def run_core(
     link = ["-nostdlib", "-T", str(SOURCES / "cortex_m.ld"), *memory, *libraries, "-lc", "-lgcc"]
     sources = _sources(kernel, "startup.c")
     _build(["arm-none-eabi-gcc", *core.flags, *flags, *sources, *link, "-o", "kernel.elf"], folder, core.name)
-    output = _run(
-        ["qemu-system-arm", "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
-        + ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native", "-kernel", "kernel.elf"],
-        folder,
-        core.name,
-        timeout_s,
-    )
-    outputs, fields, ticks = _read(folder, core.name, output, obs_f32, obs_i16)
-    return outputs, _counts(core, fields, ticks)
+    qemu = ["qemu-system-arm", "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
+    semihosting = ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native"]
+    output = _run([*qemu, *semihosting, "-kernel", "kernel.elf"], folder, core.name)
+    outputs, fields, elapsed = _read(folder, core.name, output, obs_f32, obs_i16)
+    return outputs, _counts(core, fields, elapsed)
 
 
-def size(core: Core, kernel: Path, work: Path, flags: Sequence[str] = RELEASE, libraries: Sequence[str] = ()) -> Sizes:
+def size(core: Core, kernel: Path, work: Path) -> Sizes:
     """Size of the object file of `kernel` on `core`, and of the library code that it needs."""
     folder = Path(tempfile.mkdtemp(prefix=f"{core.name}-size-", dir=work))
     compiler = ["arm-none-eabi-gcc", *core.flags]
-    _build([*compiler, *flags, "-c", str(kernel.resolve() / "qrl_policy.c"), "-o", "qrl_policy.o"], folder, core.name)
+    _build([*compiler, *RELEASE, "-c", str(kernel.resolve() / "qrl_policy.c"), "-o", "qrl_policy.o"], folder, core.name)
     entry = ["-nostdlib", "-Wl,--entry=qrl_policy_step"]
-    _build([*compiler, *entry, "qrl_policy.o", *libraries, "-lc", "-lgcc", "-o", "linked.elf"], folder, core.name)
+    _build([*compiler, *entry, "qrl_policy.o", "-lc", "-lgcc", "-o", "linked.elf"], folder, core.name)
     (text, data, bss), linked = (_sections(folder / name, core.name) for name in ("qrl_policy.o", "linked.elf"))
     return Sizes(text, data, bss, max(0, linked[0] - text))
 
 
 def _sections(path: Path, where: str) -> list[int]:
-    """Bytes of text, data and bss."""
     table = _build(["arm-none-eabi-size", path.name], path.parent, where)
     return [int(number) for number in table.splitlines()[1].split()[:3]]
 
 
 def _folder(work: Path, name: str, obs_f32: Floats, obs_i16: Ints) -> Path:
-    """A fresh folder with the observations in it."""
     folder = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=work))
     (folder / "f32.bin").write_bytes(np.ascontiguousarray(obs_f32, "<f4").tobytes())
     (folder / "i16.bin").write_bytes(np.ascontiguousarray(obs_i16, "<i2").tobytes())
@@ -182,13 +158,11 @@ def _sources(kernel: Path, platform: str) -> list[str]:
 
 def _build(command: list[str], folder: Path, where: str) -> str:
     """The command's stdout; its first line about an error, raised, if it fails."""
-    done = subprocess.run(
-        command, cwd=folder, env={**os.environ, "LC_ALL": "C"}, capture_output=True, text=True, check=False
-    )
+    environment = {**os.environ, "LC_ALL": "C"}
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise VerificationFailed(
-            f"{where}: {Path(command[0]).name}: {_first(done.stderr, 'error|undefined|overflowed|will not fit')}"
-        )
+        error = _first(done.stderr, "error|undefined|overflowed|will not fit")
+        raise VerificationFailed(f"{where}: {Path(command[0]).name}: {error}")
     return done.stdout
 
 
@@ -198,14 +172,13 @@ def _first(text: str, pattern: str) -> str:
     return next((line for line in lines if re.search(pattern, line)), lines[-1])[:300]
 
 
-def _run(command: list[str], folder: Path, where: str, timeout_s: float) -> str:
+def _run(command: list[str], folder: Path, where: str) -> str:
     """The harness's stderr; VerificationFailed if it crashes or times out."""
+    nothing = subprocess.DEVNULL
     try:
-        done = subprocess.run(
-            command, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout_s, check=False
-        )
+        done = subprocess.run(command, cwd=folder, stdin=nothing, capture_output=True, timeout=TIMEOUT_S, check=False)
     except subprocess.TimeoutExpired:
-        raise VerificationFailed(f"{where}: timed out after {timeout_s:g} s") from None
+        raise VerificationFailed(f"{where}: timed out after {TIMEOUT_S:g} s") from None
     output = done.stderr.decode(errors="replace")
     if done.returncode:
         how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit {done.returncode}"
@@ -213,33 +186,29 @@ def _run(command: list[str], folder: Path, where: str, timeout_s: float) -> str:
     return output
 
 
-def _fields(output: str, where: str) -> dict[str, int]:
-    """The fields of the result line."""
-    lines = [line for line in output.splitlines() if line.startswith("qrl-result:")]
-    if len(lines) != 1:
-        raise VerificationFailed(f"{where}: expected one result line, found {len(lines)}")
-    return {name: int(value) for name, value in re.findall(r"(\w+)=(-?\d+)", lines[0])}
-
-
 def _read(
     folder: Path, where: str, output: str, obs_f32: Floats, obs_i16: Ints
 ) -> tuple[Outputs, dict[str, int], tuple[Ints, Ints]]:
     """Outputs, the fields of the result line, and (ticks, spins) int32 [N, 2], [M, 2] of a complete run."""
-    fields = _fields(output, where)
+    lines = [line for line in output.splitlines() if line.startswith("qrl-result:")]
+    if len(lines) != 1:
+        raise VerificationFailed(f"{where}: expected one result line, found {len(lines)}")
+    fields = {name: int(value) for name, value in re.findall(r"(\w+)=(-?\d+)", lines[0])}
     expected = {"obs": obs_f32.shape[1], "vectors_f32": len(obs_f32), "vectors_i16": len(obs_i16)}
     found = {name: fields.get(name) for name in expected}
     if wrong := [f"{name}: expected {n}, found {found[name]}" for name, n in expected.items() if found[name] != n]:
         raise VerificationFailed(f"{where}: {', '.join(wrong)}")
+    act, bytes_act = fields["act"], 4 * (fields["act"] + 2)
     layouts = [
-        np.dtype([("status", "<i4"), ("act", t, fields["act"]), ("guard", t, 2), ("elapsed", "<i4", 2)], align=True)
-        for t in ("<f4", "<i2")
+        np.dtype([("status", "<i4"), ("act", t, act), ("guard", "u1", bytes_act - act * each), ("elapsed", "<i4", 2)])
+        for t, each in (("<f4", 4), ("<i2", 2))
     ]
     data, split = (folder / "out.bin").read_bytes(), len(obs_f32) * layouts[0].itemsize
     if len(data) != (length := split + len(obs_i16) * layouts[1].itemsize):
         raise VerificationFailed(f"{where}: out.bin: expected {length} bytes, found {len(data)}")
     f32, i16 = np.frombuffer(data[:split], layouts[0]), np.frombuffer(data[split:], layouts[1])
     for records, entry in ((f32, "qrl_policy_step"), (i16, "qrl_policy_step_i16")):
-        if np.any(np.ascontiguousarray(records["guard"]).view(np.uint8) != GUARD):
+        if np.any(records["guard"] != GUARD):
             raise VerificationFailed(f"{where}: {entry} writes past the end of its outputs")
     outputs = Outputs(f32["status"], f32["act"], i16["status"], i16["act"], fields["selftest"])
     return outputs, fields, (f32["elapsed"], i16["elapsed"])
@@ -262,7 +231,6 @@ def _instructions(core: Core, elapsed: Ints) -> Floats:
 
 
 def known_instructions(rounds: int) -> int:
-    """Instructions of the harness's function `known`."""
     return 2 * rounds + 3
 
 

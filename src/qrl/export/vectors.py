@@ -37,7 +37,6 @@ def with_outputs(kernel: Kernel, obs: NDArray[np.float32], obs_i16: NDArray[np.i
 
 
 def draw(policy: Policy, kernel: Kernel, n: int, seed: int = 0) -> Vectors:
-    """n vectors for each entry point."""
     return with_outputs(kernel, observations(policy, kernel, n, seed), observations_i16(policy, kernel, n, seed))
 
 

@@ -9,7 +9,7 @@ import glob
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -108,16 +108,15 @@ def discard_after(folder: Path, env_steps: int) -> None:
     for path in _steps(folder):
         if int(path.name) <= env_steps:
             continue
-        if integrity.has_manifest(path):
-            try:
+        try:
+            if integrity.has_manifest(path):
                 integrity.verify(path)
-            except (CorruptCheckpoint, IncompatibleCheckpoint):
-                quarantine = path.with_name(f"corrupt-{path.name}")
-                shutil.rmtree(quarantine, ignore_errors=True)
-                path.rename(quarantine)
-                continue
-            integrity.remove_manifest(path)  # first: no half-removed checkpoint may count as complete
-        shutil.rmtree(path)
+                integrity.remove_manifest(path)  # first: no half-removed checkpoint may count as complete
+            shutil.rmtree(path)
+        except (CorruptCheckpoint, IncompatibleCheckpoint):
+            quarantine = path.with_name(f"corrupt-{path.name}")
+            shutil.rmtree(quarantine, ignore_errors=True)
+            path.rename(quarantine)
 
 
 class Writer:
@@ -165,20 +164,14 @@ class Writer:
     def _save(self, checkpoint: Checkpoint) -> None:
         path = _root(self._folder) / str(checkpoint.env_steps)
         state = _by_name(checkpoint.state)
-        items = ocp.args.Composite(
-            **{
-                STATE: ocp.args.StandardSave(state),
-                RECORD: ocp.args.JsonSave({"run_sha256": self._run_sha256, **checkpoint.record._asdict()}),
-            }
-        )
+        record = {"run_sha256": self._run_sha256, **checkpoint.record._asdict()}
+        items = ocp.args.Composite(**{STATE: ocp.args.StandardSave(state), RECORD: ocp.args.JsonSave(record)})
+        options = _options(checkpoint.env_steps, saved_steps(self._folder), checkpoint.record.rows)
         try:
             # Orbax prints tracebacks when the disk fills up during a save.
             if shutil.disk_usage(path.parent).free < sum(leaf.nbytes for leaf in state.values()) * 5 // 4 + 2**20:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            with (
-                plain_path(path.parent) as plain,
-                ocp.CheckpointManager(plain, options=_options(checkpoint.record.rows)) as orbax,
-            ):
+            with plain_path(path.parent) as plain, ocp.CheckpointManager(plain, options=options) as orbax:
                 orbax.save(checkpoint.env_steps, args=items, force=True)
             self._check_folder()  # if it was removed meanwhile, Orbax has created it again
             integrity.write_manifest(path)
@@ -186,24 +179,16 @@ class Writer:
             raise OSError(f"{path}: the checkpoint could not be written ({first_line(error)})") from None
 
 
-class _Preserve(policies.PreservationPolicy):
-    """The last KEEP checkpoints, and the one with the best report in `rows`."""
-
-    def __init__(self, rows: Sequence[Row]) -> None:
-        self._ranks = {row["env_steps"]: (rank_key(row["success"]), rank_key(row["return_mean"])) for row in rows}
-
-    def should_preserve(self, checkpoints: Sequence[Any], *, context: Any) -> Sequence[bool]:
-        steps = [info.step for info in checkpoints]
-        best = max(self._ranks.keys() & steps, key=lambda step: (self._ranks[step], -step), default=None)
-        return [step in {*steps[-KEEP:], best} for step in steps]
-
-
-def _options(rows: Sequence[Row]) -> ocp.CheckpointManagerOptions:
+def _options(env_steps: int, saved: list[int], rows: list[Row]) -> ocp.CheckpointManagerOptions:
+    """Keeps the last KEEP checkpoints, and the one with the best report in `rows`."""
+    ranks = {row["env_steps"]: (rank_key(row["success"]), rank_key(row["return_mean"])) for row in rows}
+    best = max(ranks.keys() & {*saved, env_steps}, key=lambda step: (ranks[step], -step), default=env_steps)
+    kept = policies.AnyPreservationPolicy([policies.LatestN(KEEP), policies.CustomSteps([int(best)])])
     return ocp.CheckpointManagerOptions(
         create=False,
         cleanup_tmp_directories=True,
         enable_async_checkpointing=False,
-        preservation_policy=_Preserve(rows),
+        preservation_policy=kept,
         multiprocessing_options=_ONE_PROCESS,
     )
 

@@ -22,9 +22,9 @@ class IncompatibleCheckpoint(OSError):
 
 def write_manifest(path: Path) -> None:
     """Complete the checkpoint at `path`; every file is on disk before its manifest is."""
-    digests = {name: _sha256(path / name, sync=True) for name in _files(path)}
-    for folder in (path, *(inside for inside in path.rglob("*") if inside.is_dir())):
-        _sync(folder)
+    digests = {name: _sha256(path / name) for name in _files(path)}
+    for written in (path, *path.rglob("*")):  # Orbax leaves it to the system
+        _sync(written)
     replace_text(path / MANIFEST, json.dumps({"format": FORMAT, "sha256": digests}) + "\n")
 
 
@@ -76,15 +76,13 @@ def _files(path: Path) -> list[str]:
     return sorted(str(file.relative_to(path)) for file in path.rglob("*") if file.is_file() and file.name != MANIFEST)
 
 
-def _sha256(path: Path, *, sync: bool = False) -> str:
+def _sha256(path: Path) -> str:
     with path.open("rb") as file:
-        if sync:  # Orbax leaves it to the system
-            os.fsync(file.fileno())
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
     finally:

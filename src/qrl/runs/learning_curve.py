@@ -23,9 +23,7 @@ def learning_curve_figure(runs: list[Rows], title: str) -> Figure:
     """The figure of `learning_curve`. Axes: the return and, if any row has it, the success."""
     steps, success = aligned(runs, "success")
     has_success = bool(np.isfinite(success).any())
-    figure = Figure(figsize=(8.0, 5.4 if has_success else 3.6), dpi=PIXELS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK, parse_math=False)
+    figure = empty_figure(title, 8.0, 5.4 if has_success else 3.6)
     upper, *rest = figure.subplots(1 + has_success, 1, sharex=True, squeeze=False)[:, 0]
     if len(runs) == 1:
         worst = aligned(runs, "return_min")[1][0]
@@ -39,6 +37,19 @@ def learning_curve_figure(runs: list[Rows], title: str) -> Figure:
         _finish(lower, "success", steps)
     (rest or [upper])[-1].set_xlabel("environment steps", fontsize=11)
     return figure
+
+
+def empty_figure(title: str, width_in: float, height_in: float) -> Figure:
+    figure = Figure(figsize=(width_in, height_in), dpi=PIXELS_PER_INCH, layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK, parse_math=False)
+    return figure
+
+
+def plain_style(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(color="#DDDDDD", linewidth=0.6)
+    axes.set_axisbelow(True)
 
 
 def aligned(runs: list[Rows], key: str) -> tuple[np.ndarray, np.ndarray]:
@@ -65,17 +76,12 @@ def number(row: dict[str, float | str], key: str) -> float:
         return float("nan")
 
 
-def _min_median_max(values: np.ndarray) -> np.ndarray:
-    """(minimum, median, maximum) over the finite of `values` [runs, x] at each x: [3, x]; NaN if none is finite."""
+def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, label: str = "") -> None:
+    """Draw one run as a line, several as their median and a band of their range; `values` [runs, x]."""
     quantiles = np.full((3, values.shape[1]), np.nan)
     finite = np.isfinite(values).any(axis=0)
     quantiles[:, finite] = np.nanquantile(values[:, finite], [0.0, 0.5, 1.0], axis=0)
-    return quantiles
-
-
-def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, label: str = "") -> None:
-    """Draw one run as a line, several as their median and a band of their range; `values` [runs, x]."""
-    low, median, high = _min_median_max(values)
+    low, median, high = quantiles
     if len(values) > 1:
         axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0, label="range")
         axes.plot(steps, values.T, color=color, alpha=0.35, linewidth=0.8)
@@ -89,9 +95,7 @@ def _marker(steps: np.ndarray) -> str:
 
 def _finish(axes: Axes, label: str, steps: np.ndarray) -> None:
     axes.set_ylabel(label, fontsize=11)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#DDDDDD", linewidth=0.6)
-    axes.set_axisbelow(True)
+    plain_style(axes)
     axes.tick_params(labelsize=10.5)
     axes.xaxis.set_major_formatter(EngFormatter())
     if steps.max(initial=0.0) > 0.0:

@@ -17,13 +17,15 @@ FORMAT: Literal[1] = 1
 _PACKAGES = ("qrl", "jax", "jaxlib", "brax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-class TaskRecord(BaseModel):
-    """The task's name as the user gave it and, for environments of qrl_envs, the content of its task file."""
-
+class _Record(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+
+class TaskRecord(_Record):
+    """The task's name as the user gave it and, for environments of qrl_envs, the content of its task file."""
+
     name: str
-    spec: dict[str, Any] | None  # null: an environment of Brax
+    spec: dict[str, Any] | None  # null: another environment
 
 
 def with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
@@ -32,10 +34,8 @@ def with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
     return data | {"learner": current_names(learner, f"{where}: learner")} if isinstance(learner, dict) else data
 
 
-class ConfigFile(BaseModel):
+class ConfigFile(_Record):
     """The file of CONFIG=: a run's config.json, or any part of one. Versions and devices are information only."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal[1] = FORMAT
     task: str | TaskRecord | None = None
@@ -46,10 +46,8 @@ class ConfigFile(BaseModel):
     devices: list[str] = []
 
 
-class RunConfig(BaseModel):
+class RunConfig(_Record):
     """config.json: sufficient to repeat the run."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     format: Literal[1] = FORMAT
     task: TaskRecord
@@ -78,17 +76,13 @@ def versions() -> dict[str, str]:
 def commit() -> str:
     """The commit of this code, with a "+" if tracked files have changed since; "unknown" outside a checkout."""
     root = Path(__file__).parents[3]
+    if not (root / ".git").exists():
+        return "unknown"
+    command = ["git", "-C", str(root), "describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+"]
     try:
-        if not (root / ".git").exists():
-            return "unknown"
-        git = ["git", "-C", str(root)]
-        head = subprocess.run([*git, "rev-parse", "--short=12", "HEAD"], capture_output=True, text=True, check=True)
-        changed = subprocess.run(
-            [*git, "status", "--porcelain", "--untracked-files=no"], capture_output=True, check=True
-        )
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
-    return head.stdout.strip() + ("+" if changed.stdout.strip() else "")
 
 
 def member_folders(out: Path, run: RunConfig) -> list[Path]:

@@ -25,28 +25,6 @@ MEASURES = ("settle_", "rms_")
 EVALUATION = "task.evaluation"  # the same for all points, else they could not be compared
 
 
-@dataclass(frozen=True)
-class Axis:
-    """Values of one setting, or named settings of several."""
-
-    values: tuple[Any, ...]  # of the setting; of named settings the names
-    named: dict[str, dict[str, Any]] | None = None
-
-    def settings(self, name: str, value: Any) -> dict[str, Any]:
-        return self.named[value] if self.named is not None else {name: value}
-
-    def names(self, name: str) -> list[str]:
-        """The settings that this axis sets."""
-        return list(dict.fromkeys(key for s in self.named.values() for key in s)) if self.named is not None else [name]
-
-    @property
-    def size(self) -> int:
-        return len(self.values)
-
-    def draw(self, rng: np.random.Generator) -> Any:
-        return self.values[rng.integers(len(self.values))]
-
-
 class Range(Spec):
     """Numbers from an interval: `count` of them, evenly spaced (linear or logarithmic), or drawn at random."""
 
@@ -63,21 +41,6 @@ class Range(Spec):
             raise ValueError(f"expected from > 0 with log spacing, found {self.from_}")
         return self
 
-    def settings(self, name: str, value: Any) -> dict[str, Any]:
-        return {name: value}
-
-    def names(self, name: str) -> list[str]:
-        return [name]
-
-    @property
-    def size(self) -> int:
-        return self.count or 1
-
-    @property
-    def values(self) -> tuple[float, ...]:
-        """Computed on access: `size` alone decides whether a grid fits into memory."""
-        return tuple(self.at(i / (self.size - 1)) for i in range(self.size))
-
     def at(self, share: float) -> float:
         """The number a fraction `share` of the way from `from` to `to`."""
         if self.spacing == "log":
@@ -86,8 +49,35 @@ class Range(Spec):
             value = self.from_ + share * (self.to - self.from_)
         return float(f"{value:.{DIGITS}g}")
 
-    def draw(self, rng: np.random.Generator) -> float:
-        return self.at(rng.random())
+
+@dataclass(frozen=True)
+class Axis:
+    """Values of one setting, or named settings of several."""
+
+    name: str
+    choices: list[Any] | Range | dict[str, dict[str, Any]]
+
+    def settings(self, value: Any) -> dict[str, Any]:
+        return self.choices[value] if isinstance(self.choices, dict) else {self.name: value}
+
+    def names(self) -> list[str]:
+        if isinstance(self.choices, dict):
+            return list(dict.fromkeys(key for settings in self.choices.values() for key in settings))
+        return [self.name]
+
+    @property
+    def size(self) -> int:
+        return (self.choices.count or 1) if isinstance(self.choices, Range) else len(self.choices)
+
+    def values(self) -> list[Any]:
+        if isinstance(self.choices, Range):
+            return [self.choices.at(i / (self.size - 1)) for i in range(self.size)]
+        return list(self.choices)
+
+    def draw(self, rng: np.random.Generator) -> Any:
+        if isinstance(self.choices, Range):
+            return self.choices.at(rng.random())
+        return list(self.choices)[rng.integers(self.size)]
 
 
 def settable(task: TaskRecord) -> list[str]:
@@ -117,51 +107,39 @@ def put(spec: Any, path: list[str], value: Any) -> Any:
     return {**spec, first: put(spec[first], rest, value)}
 
 
-def axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) -> Axis | Range:
+def parse_axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) -> Axis:
     """One axis as the grid file writes it: a list, a range, or an object of named settings."""
     key = f"{where}: key 'axes.{name}'"
     if value in ([], {}):
         raise BadInput(f"{key}: expected at least one value, found none")
     if isinstance(value, list):
-        return Axis(tuple(value))
+        return Axis(name, value)
     if not isinstance(value, dict):
         raise BadInput(f"{key}: expected a list of values, a range or named settings, found {json.dumps(value)[:57]}")
     if all(isinstance(inner, dict) for inner in value.values()):
-        if name in known:
-            raise BadInput(f"{key}: expected another name for named settings than that of a setting")
-        _check_title(name, value, key)
-        return Axis(tuple(value), value)
+        if not name or "" in value:
+            raise BadInput(f'{key}: expected a name for {"each of its settings" if name else "the axis"}, found ""')
+        if name in (*known, *COLUMNS) or name.startswith(MEASURES):
+            raise BadInput(f"{key}: expected another name than that of a setting or a column of results.csv")
+        return Axis(name, value)
     span = specfile.build(Range, value, f"{where}: axes.{name}")
     if (span.count is None) != sampled:
         expected = "no count where points are sampled" if sampled else "a count, or else 'sample'"
         raise BadInput(f"{key}: expected {expected}, found {json.dumps(value)}")
     if span.count == 1:
         raise BadInput(f"{key}: expected a range of at least 2 values, found count 1")
-    return span
+    return Axis(name, span)
 
 
-def _check_title(name: str, settings: dict[str, Any], key: str) -> None:
-    if not name or "" in settings:
-        raise BadInput(f'{key}: expected a name for {"each of its settings" if name else "the axis"}, found ""')
-    if name in COLUMNS or name.startswith(MEASURES):
-        raise BadInput(f"{key}: expected another name than that of a column of results.csv, found '{name}'")
-
-
-def check_conflicts(fixed: dict[str, Any], axes: dict[str, Axis | Range], known: list[str], where: str) -> None:
-    """BadInput if a name is unknown, or set twice."""
-    setters = dict.fromkeys(fixed, "fixed")
-    for name in fixed:
-        _check_known(name, known, f"{where}: fixed")
-    for title, values in axes.items():
-        for name in values.names(title):
-            _check_known(name, known, f"{where}: axes")
+def check_names(fixed: dict[str, Any], axes: list[Axis], known: list[str], where: str) -> None:
+    """BadInput if a setting is unknown, or set twice."""
+    setters: dict[str, str] = {}
+    for setter, names in [("fixed", list(fixed)), *((f"axes.{axis.name}", axis.names()) for axis in axes)]:
+        for name in names:
+            if name.startswith(EVALUATION):
+                raise BadInput(f"{where}: key '{name}': all points of a grid have the same evaluation")
+            if name not in known:
+                raise BadInput(f"{where}: {setter}: unknown key '{name}'{specfile.nearest(name, known)}")
             if name in setters:
-                raise BadInput(f"{where}: key 'axes.{title}': '{name}' is set in '{setters[name]}' too")
-            setters[name] = f"axes.{title}"
-
-
-def _check_known(name: str, known: list[str], where: str) -> None:
-    if name.startswith(EVALUATION):
-        raise BadInput(f"{where}: key '{name}': all points of a grid have the same evaluation")
-    if name not in known:
-        raise BadInput(f"{where}: unknown key '{name}'{specfile.nearest(name, known)}")
+                raise BadInput(f"{where}: key '{setter}': '{name}' is set in '{setters[name]}' too")
+            setters[name] = setter

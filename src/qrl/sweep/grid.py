@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,7 +14,7 @@ from pydantic import BeforeValidator, Field
 from qrl import tasks
 from qrl.config import Config, current_names
 from qrl.runs.record import TaskRecord
-from qrl.sweep.axes import Axis, Range, axis, check_conflicts, put, settable
+from qrl.sweep.axes import Axis, check_names, parse_axis, put, settable
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput, Count, CountOrZero, Spec
@@ -23,8 +24,6 @@ REPORT_BYTES = 3_000  # and for each report of a member: a row of some twenty nu
 
 
 class Sample(Spec):
-    """Random points, in place of the full grid."""
-
     count: Count
     seed: CountOrZero = 0
 
@@ -83,7 +82,6 @@ class Grid:
     """A whole sweep: every point is trained with every seed."""
 
     file: GridFile
-    axes: dict[str, Axis | Range]
     points: list[GridPoint]
 
     @property
@@ -100,7 +98,6 @@ class Grid:
         return {"format": 1, "grid": self.file.model_dump(mode="json"), "points": points}
 
     def groups(self) -> list[list[int]]:
-        """Indices of the points of each compiled program."""
         groups: dict[str, list[int]] = {}
         for i, point in enumerate(self.points):
             groups.setdefault(point.static, []).append(i)
@@ -109,55 +106,52 @@ class Grid:
 
 def load(path: Path, budget_bytes: float) -> Grid:
     """The grid in the file at `path`; refused where its points alone do not fit into the memory budget."""
-    file = specfile.build(GridFile, _with_current_names(specfile.read(path), str(path)), str(path))
+    where = str(path)
+    file = _with_current_names(specfile.build(GridFile, specfile.read(path), where), where)
     if len(set(file.seeds)) < len(file.seeds):
         raise BadInput(f"{path}: key 'seeds': expected each seed once, found {list(file.seeds)}")
     task = tasks.task_named(file.task, path)
     known = settable(task)
-    axes = {
-        name: axis(name, value, known, str(path), sampled=file.sample is not None) for name, value in file.axes.items()
-    }
-    check_conflicts(file.fixed, axes, known, str(path))
-    count = file.sample.count if file.sample else math.prod(a.size for a in axes.values())
-    reports = file.fixed.get("num_evals", tasks.task_preset(task, str(path))["num_evals"])
-    kept = (
-        len(file.seeds)
-        * REPORT_BYTES
-        * (int(reports) if isinstance(reports, int | float) and 1 <= reports < 2**31 else 1)
-    )
-    need = count * (POINT_BYTES + kept)
-    if need > budget_bytes:
-        raise BadInput(
-            f"{path}: expected a grid that fits into {budget_bytes / 1e9:g} GB of memory, found {count:,} points"
-            f" × {len(file.seeds):,} seeds, which need {need / 1e9:,.1f} GB"
-        )
-    all_coordinates = _sampled(axes, file.sample, str(path)) if file.sample else _product(axes)
+    axes = [parse_axis(name, value, known, where, sampled=file.sample is not None) for name, value in file.axes.items()]
+    check_names(file.fixed, axes, known, where)
+    _check_size(file, axes, tasks.task_preset(task, where)["num_evals"], budget_bytes, where)
     points: dict[str, GridPoint] = {}
-    for coordinates in all_coordinates:
-        point = _point(task, file.fixed, axes, coordinates, str(path))
+    for values in _sampled(axes, file.sample, where) if file.sample else itertools.product(*[a.values() for a in axes]):
+        point = _point(task, file.fixed, axes, values, where)
         key = _in_single([point.task.spec, point.learner.model_dump(mode="json")])
         if key in points:
             raise BadInput(
-                f"{path}: expected each point once, found {describe(coordinates)} and"
+                f"{path}: expected each point once, found {describe(point.coordinates)} and"
                 f" {describe(points[key].coordinates)}, the same in single precision"
             )
         points[key] = point
-        _check_comparable(next(iter(points.values())), point, str(path))
-    return Grid(file, axes, list(points.values()))
+        _check_comparable(next(iter(points.values())), point, where)
+    return Grid(file, list(points.values()))
 
 
-def _with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
-    """The content of a grid file with hyperparameters under their current names."""
-
-    def renamed(value: Any, key: str) -> Any:
+def _with_current_names(file: GridFile, where: str) -> GridFile:
+    def current(value: Any, key: str) -> Any:
         return current_names(value, f"{where}: {key}") if isinstance(value, dict) else value
 
-    data = {key: renamed(value, key) if key in ("fixed", "axes") else value for key, value in data.items()}
-    if isinstance(axes := data.get("axes"), dict):
-        for name, settings in axes.items():
-            if isinstance(settings, dict):  # a range keeps its own keys: none of them is a former name
-                axes[name] = {key: renamed(value, f"axes.{name}.{key}") for key, value in settings.items()}
-    return data
+    axes = current(file.axes, "axes")
+    for name, choices in axes.items():
+        if isinstance(choices, dict):  # named settings, or a range, whose own keys stay
+            axes[name] = {label: current(settings, f"axes.{name}.{label}") for label, settings in choices.items()}
+    return file.model_copy(update={"fixed": current(file.fixed, "fixed"), "axes": axes})
+
+
+def _check_size(file: GridFile, axes: list[Axis], num_evals: int, budget_bytes: float, where: str) -> None:
+    """BadInput if the points and reports do not fit into the budget; before any is made."""
+    count = file.sample.count if file.sample else math.prod(a.size for a in axes)
+    reports = file.fixed.get("num_evals", num_evals)
+    if not (isinstance(reports, int | float) and 1 <= reports < 2**31):
+        reports = 1  # refused later, with its key
+    need = count * (POINT_BYTES + len(file.seeds) * REPORT_BYTES * int(reports))
+    if need > budget_bytes:
+        raise BadInput(
+            f"{where}: expected a grid that fits into {budget_bytes / 1e9:g} GB of memory, found {count:,} points"
+            f" × {len(file.seeds):,} seeds, which need {need / 1e9:,.1f} GB"
+        )
 
 
 def _in_single(value: Any) -> str:
@@ -176,45 +170,45 @@ def _check_comparable(first: GridPoint, point: GridPoint, where: str) -> None:
 
 
 def describe(coordinates: dict[str, Any]) -> str:
-    """The coordinates as one line."""
-    return ", ".join(
-        f"{name} {value if isinstance(value, str) else json.dumps(value)}" for name, value in coordinates.items()
-    )
+    return ", ".join(f"{name} {text(value)}" for name, value in coordinates.items())
 
 
-def _product(axes: dict[str, Any]) -> list[dict[str, Any]]:
-    return [dict(zip(axes, values, strict=True)) for values in itertools.product(*[a.values for a in axes.values()])]
+def text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
 
 
-def _sampled(axes: dict[str, Axis | Range], sample: Sample, where: str) -> list[dict[str, Any]]:
-    """Points drawn at random, each different from those before it."""
+def _sampled(axes: list[Axis], sample: Sample, where: str) -> list[list[Any]]:
+    """Values of points drawn at random, each different from those before it."""
     rng = np.random.default_rng(sample.seed)
-    all_coordinates: dict[str, dict[str, Any]] = {}
+    drawn: dict[str, list[Any]] = {}
     idle = 0  # draws since the last that was new; where one of n + 1 points is left, n draws in a row on average
-    while idle < 20 * len(all_coordinates) + 1000:
-        coordinates = {name: axis.draw(rng) for name, axis in axes.items()}
-        idle = 0 if all_coordinates.setdefault(json.dumps(coordinates), coordinates) is coordinates else idle + 1
-        if len(all_coordinates) == sample.count:
-            return list(all_coordinates.values())
+    while idle < 20 * len(drawn) + 1000:
+        values = [axis.draw(rng) for axis in axes]
+        idle = 0 if drawn.setdefault(json.dumps(values), values) is values else idle + 1
+        if len(drawn) == sample.count:
+            return list(drawn.values())
     raise BadInput(
         f"{where}: key 'sample.count': expected no more points than the axes hold, found {sample.count:,};"
-        f" {len(all_coordinates):,} different ones were drawn"
+        f" {len(drawn):,} different ones were drawn"
     )
 
 
-def _point(
-    task: TaskRecord, fixed: dict[str, Any], axes: dict[str, Axis | Range], coordinates: dict[str, Any], where: str
-) -> GridPoint:
-    settings = dict(fixed)
-    for name, value in coordinates.items():
-        settings |= axes[name].settings(name, value)
-    learner = {name: value for name, value in settings.items() if not name.startswith("task.")}
+def _point(task: TaskRecord, fixed: dict[str, Any], axes: list[Axis], values: Iterable[Any], where: str) -> GridPoint:
+    coordinates, settings = {}, dict(fixed)
+    for axis, value in zip(axes, values, strict=True):
+        coordinates[axis.name] = value
+        settings |= axis.settings(value)
     where = f"{where}: at {describe(coordinates)}"
     spec: Any = task.spec
+    learner = tasks.task_preset(task, where)
     for name, value in settings.items():
         if name.startswith("task."):
             spec = put(spec, name.split(".")[1:], value)
+        elif name.endswith("_layer_sizes") and not isinstance(value, list):
+            raise BadInput(f"{where}: key '{name}': expected a list of layer sizes such as [64], found {value}")
+        else:
+            learner[name] = value
     if spec is not task.spec:
         checked = task_spec.from_data(spec, f"{where}: task").model_dump(mode="json", exclude_none=True)
         task = TaskRecord(name=task.name, spec=checked)
-    return GridPoint(coordinates, task, specfile.build(Config, tasks.task_preset(task, where) | learner, where))
+    return GridPoint(coordinates, task, specfile.build(Config, learner, where))

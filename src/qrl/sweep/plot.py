@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from qrl.runs.learning_curve import BLUE, GREEN, INK, PIXELS_PER_INCH
+from qrl.runs.learning_curve import BLUE, GREEN, INK, empty_figure, plain_style
 
 LOG_ABOVE = 20.0  # ratio of the greatest to the least value from which an axis is logarithmic
 LABELLED = 120  # cells of a heat map that still have room for their numbers
-COLOURS = {"return_mean": BLUE, "success": GREEN}
+COLORS = {"return_mean": BLUE, "success": GREEN}
 NAMES = {"return_mean": "return", "success": "success"}
 Summary = dict[str, Any]  # {"at": {axis: value}, metric: {"median", "q1", "q3"}}
 
@@ -27,12 +26,10 @@ def sweep(path: Path, found: Sequence[Summary], title: str) -> None:
 def sweep_figure(found: Sequence[Summary], title: str) -> Figure:
     """What `sweep` saves. Axes: a row for each metric."""
     names = list(found[0]["at"])
-    metrics = [m for m in COLOURS if any(np.isfinite(f[m]["median"]) for f in found)] or ["return_mean"]
+    metrics = [m for m in COLORS if any(np.isfinite(f[m]["median"]) for f in found)] or ["return_mean"]
     grid = len(names) == 2 and len(found) == len(_labels(found, names[0])) * len(_labels(found, names[1]))
     columns = 1 if grid or len(names) == 1 else len(names)
-    figure = Figure(figsize=(max(6.0, 3.4 * columns), 3.4 * len(metrics)), dpi=PIXELS_PER_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, fontsize=13, fontweight="bold", color=INK, parse_math=False)
+    figure = empty_figure(title, max(6.0, 3.4 * columns), 3.4 * len(metrics))
     for row, metric in zip(figure.subplots(len(metrics), columns, squeeze=False), metrics, strict=True):
         if grid:
             _heat_map(row[0], found, names, metric)
@@ -44,22 +41,22 @@ def sweep_figure(found: Sequence[Summary], title: str) -> Figure:
 
 def _panel(axes: Axes, found: Sequence[Summary], name: str, metric: str, *, band: bool) -> None:
     """Median of each point over its coordinate on one axis; for a single axis with the quartiles over seeds."""
-    x, colour = _positions(found, name), COLOURS[metric]
+    x, color = _positions(found, name), COLORS[metric]
     median, low, high = (np.array([f[metric][q] for f in found], float) for q in ("median", "q1", "q3"))
     median, low, high = (np.where(np.isfinite(v), v, np.nan) for v in (median, low, high))
     order = np.argsort(x, kind="stable")
     if band and _numeric(found, name):
-        axes.fill_between(x[order], low[order], high[order], color=colour, alpha=0.2, linewidth=0, label="quartiles")
-        axes.plot(x[order], median[order], color=colour, linewidth=2, marker="o", label="median over seeds")
+        axes.fill_between(x[order], low[order], high[order], color=color, alpha=0.2, linewidth=0, label="quartiles")
+        axes.plot(x[order], median[order], color=color, linewidth=2, marker="o", label="median over seeds")
         axes.legend(frameon=False, fontsize=9)
     elif band:
-        axes.errorbar(x, median, np.array([median - low, high - median]), color=colour, fmt="o", capsize=4)
+        axes.errorbar(x, median, np.array([median - low, high - median]), color=color, fmt="o", capsize=4)
     else:
-        axes.plot(x, median, "o", color=colour, alpha=0.5, markersize=4)
+        axes.plot(x, median, "o", color=color, alpha=0.5, markersize=4)
         unique = np.unique(x)
         if len(unique) < len(x):
             middles = [np.nanmedian(m) if np.isfinite(m := median[x == p]).any() else np.nan for p in unique]
-            axes.plot(unique, middles, color=colour, linewidth=2)
+            axes.plot(unique, middles, color=color, linewidth=2)
     _finish(axes, found, name, metric)
 
 
@@ -74,13 +71,10 @@ def _finish(axes: Axes, found: Sequence[Summary], name: str, metric: str) -> Non
             axes.set_xscale("log")
     axes.set_xlabel(name, parse_math=False)
     axes.set_ylabel(NAMES[metric])
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(color="#DDDDDD", linewidth=0.6)
-    axes.set_axisbelow(True)
+    plain_style(axes)
 
 
 def _heat_map(axes: Axes, found: Sequence[Summary], names: list[str], metric: str) -> None:
-    """Medians over both axes; a point without one stays grey."""
     down, across = (_labels(found, name) for name in names)
     cells = np.full((len(down), len(across)), np.nan)
     for f in found:
@@ -98,8 +92,8 @@ def _heat_map(axes: Axes, found: Sequence[Summary], names: list[str], metric: st
     if cells.size <= LABELLED:
         for (i, j), value in np.ndenumerate(cells):
             light = np.asarray(image.norm(np.array([value]))).item() > 0.6  # of viridis' two ends
-            colour = INK if light else "white"
-            axes.text(j, i, f"{value:.4g}", ha="center", va="center", fontsize=8, color=colour)
+            color = INK if light else "white"
+            axes.text(j, i, f"{value:.4g}", ha="center", va="center", fontsize=8, color=color)
 
 
 def _numeric(found: Sequence[Summary], name: str) -> bool:

@@ -28,7 +28,6 @@ def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
 
 
 def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
-    """Every report of every point and seed."""
     return [
         {**_label(grid, index), **{name: row[name] for name in CURVE}}
         for index, result in sorted(results.items())
@@ -65,9 +64,9 @@ def summaries(grid: Grid, results: dict[int, Result]) -> list[Summary]:
 def _worst(name: str, measured: bool) -> float:
     if name.startswith(("settle_", "rms_")):
         return math.inf
-    return {"success": 0.0 if measured else math.nan, "return_mean": -math.inf, "return_min": -math.inf}.get(
-        name, math.nan
-    )
+    if name in ("return_mean", "return_min"):
+        return -math.inf
+    return 0.0 if name == "success" and measured else math.nan
 
 
 def _quartiles(values: list[float]) -> dict[str, float]:
@@ -77,20 +76,18 @@ def _quartiles(values: list[float]) -> dict[str, float]:
 
 def _quantile(ordered: Any, share: float) -> float:
     """NumPy's linear quantile, defined for infinities too: between an infinity and a number lies that infinity."""
-    if np.isfinite(ordered).all() or np.isnan(ordered[-1]):
-        return float(np.quantile(ordered, share))
     position = share * (len(ordered) - 1)
     low, high = float(ordered[math.floor(position)]), float(ordered[math.ceil(position)])
-    if low == high:  # one element, or the same infinity
-        return low
-    fraction = position - math.floor(position)
-    return low * (1 - fraction) + high * fraction
+    if np.isnan(ordered[-1]):
+        return math.nan
+    fraction = position % 1
+    return low if low == high else low * (1 - fraction) + high * fraction
 
 
-def best(found: list[Summary], results: dict[int, Result], seeds: int) -> int | None:
+def best(found: list[Summary]) -> int | None:
     """The point of the highest median success and, among equals, median return; None if all diverged."""
-    alive = [summary for summary in found if summary["diverged"] < seeds]
-    return max(alive, key=_rank)["point"] if alive else None
+    first = ranked(found)[0]
+    return first["point"] if first["diverged"] < first["seeds"] else None
 
 
 def _rank(summary: Summary) -> tuple[bool, float, float]:
@@ -99,7 +96,6 @@ def _rank(summary: Summary) -> tuple[bool, float, float]:
 
 
 def ranked(found: list[Summary]) -> list[Summary]:
-    """Best first."""
     return sorted(found, key=_rank, reverse=True)
 
 
@@ -119,10 +115,9 @@ def best_run_config(grid: Grid, results: dict[int, Result], point: int) -> RunCo
 
 
 def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Summary], seconds: float) -> None:
-    """results.csv, curves.csv, best.json and, last, summary.json."""
     files.replace_text(out / "results.csv", files.csv_text(table(grid, results)))
     files.replace_text(out / "curves.csv", files.csv_text(curves(grid, results)))
-    winner = best(found, results, len(grid.seeds))
+    winner = best(found)
     if winner is not None:
         files.write_json(out / "best.json", best_run_config(grid, results, winner).model_dump(mode="json"))
     summary = {"best": winner, "programs": len(grid.groups()), "points": found, "command_seconds": round(seconds, 1)}

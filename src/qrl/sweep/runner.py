@@ -9,9 +9,8 @@ import math
 import threading
 import time
 import zlib
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Queue
@@ -30,12 +29,11 @@ from qrl.training.trainer import Trainer
 CPU_CHUNK = 8
 
 
-class Member(NamedTuple):
-    """One point with one seed."""
-
-    number: int  # in the sweep: index of the point · number of seeds + index of the seed
+@dataclass(frozen=True)
+class Member:
+    index: int  # in the sweep: index of the point · number of seeds + index of the seed
     seed: int
-    point: MemberInputs
+    inputs: MemberInputs
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,6 @@ class Group:
 
     @property
     def steps(self) -> int:
-        """Environment steps of one member."""
         config = self.trainer.config
         return config.num_unrolls * config.steps_per_unroll
 
@@ -59,38 +56,30 @@ class Result(NamedTuple):
     diverged: str  # what was not finite first, and when; "" if all was finite
 
 
-@dataclass(frozen=True)
-class Compiling:
-    """The programs of a group are compiled now, for `chunk` members at once."""
+class Compiling(NamedTuple):
+    """The programs of a group are compiled now, for `size` members at once."""
 
-    group: Group
+    size: int
+
+
+class Progress(NamedTuple):
+    """Heartbeat of a chunk, which its first member's index names."""
+
     chunk: int
+    env_steps: int  # of all its members
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Heartbeat: progress of a worker's chunk."""
-
-    group: Group
-    worker: int
-    env_steps: int  # of all members of the chunk
-
-
-@dataclass(frozen=True)
-class ChunkDone:
-    """A chunk is recorded."""
-
-    group: Group
-    worker: int
+class ChunkDone(NamedTuple):
+    chunk: int
     results: dict[int, Result]
     seconds: float
 
 
-def member_bytes(trainer: Trainer, point: MemberInputs) -> int:
+def member_bytes(trainer: Trainer, inputs: MemberInputs) -> int:
     """Bytes of device memory of a member: its state twice (input and output of the program), and its flights."""
-    seeds, points = _abstract_inputs([Member(0, 0, point)], 1, None)
-    states = jax.eval_shape(trainer.init, seeds, points)
-    flights = jax.eval_shape(trainer.fly, states.learner, points, driver.report_starts(trainer.config))
+    one = stack([inputs])
+    states = jax.eval_shape(trainer.init, driver.seeds(0, 1), one)
+    flights = jax.eval_shape(trainer.fly, states.learner, one, driver.report_starts(trainer.config))
     return 2 * _bytes(states) + _bytes(flights)
 
 
@@ -120,74 +109,65 @@ def run(
     A device may occur several times: a CPU runs a program on about one core, and can run several at a time.
     """
     done = finished(folder)
-    remaining = [member for member in group.members if member.number not in done]
+    remaining = [member for member in group.members if member.index not in done]
     if not remaining or stopped():
         return
-    size = chunk_members(len(remaining), member_bytes(group.trainer, remaining[0].point), budget_bytes, len(devices))
+    each_bytes = member_bytes(group.trainer, remaining[0].inputs)
+    size = chunk_members(len(remaining), each_bytes, budget_bytes, len(devices))
     folder.mkdir(parents=True, exist_ok=True)
-    yield Compiling(group, size)
+    yield Compiling(size)
     programs = {device: _compiled(group.trainer, remaining, size, device) for device in set(devices)}
-    chunks = deque(remaining[i : i + size] for i in range(0, len(remaining), size))
+    chunks = iter([remaining[i : i + size] for i in range(0, len(remaining), size)])
     events: Queue[Any] = Queue()
     halt = threading.Event()
 
-    def work(worker: int, device: Any) -> None:
+    def work(device: Any) -> None:
         try:
-            while not halt.is_set() and (members := _next(chunks)):
+            for members in chunks:  # each worker takes the next
+                if halt.is_set():
+                    break
                 for event in _chunk(group, programs[device], members, size, device, folder, halt.is_set):
-                    events.put(event(worker))
+                    events.put(event)
             events.put(None)
         except BaseException as error:
             events.put(error)
 
-    threads = [threading.Thread(target=work, args=pair, daemon=True) for pair in enumerate(devices)]
-    for thread in threads:
-        thread.start()
-    working = len(devices)
-    try:
-        while working:
-            event = events.get()
-            if isinstance(event, BaseException):
-                raise event
-            if stopped():
-                halt.set()
-            if event is None:
-                working -= 1
-            else:
-                yield event
-    finally:
-        halt.set()
-        for thread in threads:  # until its chunk of steps ends: Python must not exit while a thread is inside XLA
-            thread.join()
+    with ThreadPoolExecutor(len(devices)) as pool:  # its end waits: Python must not exit while a thread is inside XLA
+        try:
+            pool.map(work, devices)
+            working = len(devices)
+            while working:
+                event = events.get()
+                if isinstance(event, BaseException):
+                    raise event
+                if stopped():
+                    halt.set()
+                if event is None:
+                    working -= 1
+                else:
+                    yield event
+        finally:
+            halt.set()
 
 
-def _next(chunks: deque[list[Member]]) -> list[Member]:
-    """The next chunk; empty if none is left."""
-    with suppress(IndexError):
-        return chunks.popleft()
-    return []
-
-
-def _abstract_inputs(members: list[Member], size: int, device: Any) -> tuple[Any, Any]:
-    """Shapes and types of the seeds and points of a chunk."""
-    sharding = SingleDeviceSharding(device) if device else None
-    points = jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct((size, *x.shape), x.dtype, sharding=sharding), members[0].point
-    )
-    return jax.ShapeDtypeStruct((size,), np.int32, sharding=sharding), points
+def _inputs(members: list[Member], size: int, device: Any) -> tuple[jax.Array, MemberInputs]:
+    """Seeds and inputs of `size` members on the device, the last one repeated."""
+    padded = members + [members[-1]] * (size - len(members))
+    seeds = np.asarray([member.seed for member in padded], np.int32)
+    return jax.device_put((seeds, stack([member.inputs for member in padded])), device)
 
 
 def _compiled(trainer: Trainer, members: list[Member], size: int, device: Any) -> tuple[Any, driver.Programs]:
     """The program of the initial states, and those of training, for chunks of `size` members."""
-    seeds, points = _abstract_inputs(members, size, device)
+    seeds, inputs = _inputs(members[:size], size, device)
     states = jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=SingleDeviceSharding(device)),
-        jax.eval_shape(trainer.init, seeds, points),
+        jax.eval_shape(trainer.init, seeds, inputs),
     )
     train, apg, fly = (
-        compiled(trainer, states, points) for compiled in (driver.compile_train, driver.compile_apg, driver.compile_fly)
+        compiled(trainer, states, inputs) for compiled in (driver.compile_train, driver.compile_apg, driver.compile_fly)
     )
-    return trainer.init.lower(seeds, points).compile(), driver.Programs(train, lambda: apg, fly, trainer.gather)
+    return trainer.init.lower(seeds, inputs).compile(), driver.Programs(train, lambda: apg, fly, trainer.gather)
 
 
 def _chunk(
@@ -198,42 +178,38 @@ def _chunk(
     device: Any,
     folder: Path,
     halted: Callable[[], bool],
-) -> Iterator[Callable[[int], Progress | ChunkDone]]:
-    """Train a chunk and record it, unless `halted()`; yields functions worker -> event."""
-    began = time.perf_counter()
-    padded = members + [members[-1]] * (size - len(members))  # the program is compiled for `size` members
-    points = jax.device_put(stack([member.point for member in padded]), device)
-    seeds = jax.device_put(np.asarray([member.seed for member in padded], np.int32), device)
-    states = programs[0](seeds, points)
+) -> Iterator[Progress | ChunkDone]:
+    """Train a chunk and record it, unless `halted()`."""
+    start_time, chunk = time.perf_counter(), members[0].index
+    seeds, inputs = _inputs(members, size, device)
+    states = programs[0](seeds, inputs)
     rows: list[list[Row]] = [[] for _ in members]
     faults: list[str] = []
-    for update in driver.run_chunks(states, points, programs[1], group.trainer.config, driver.Clock(), halted):
-        faults, env_steps = update.faults, update.env_steps * len(members)
+    for update in driver.run_chunks(states, inputs, programs[1], group.trainer.config, driver.Clock(), halted):
+        faults = update.faults
         for kept, row in zip(rows, update.rows, strict=False):  # without the padding
             share = {"train_seconds": round(row["train_seconds"] / len(members), 3)}
             kept.append({key: value for key, value in (row | share).items() if key != "steps_per_second"})
-        yield lambda worker, env_steps=env_steps: Progress(group, worker, env_steps)
+        yield Progress(chunk, update.env_steps * len(members))
     if all(kept and kept[-1]["env_steps"] == group.steps for kept in rows):
-        results = {member.number: Result(rows[i], faults[i]) for i, member in enumerate(members)}
-        replace_text(folder / f"{members[0].number:07d}.json", json.dumps(record(results)) + "\n")
-        seconds = time.perf_counter() - began
-        yield lambda worker: ChunkDone(group, worker, results, seconds)
+        results = {member.index: Result(rows[i], faults[i]) for i, member in enumerate(members)}
+        replace_text(folder / f"{chunk:07d}.json", json.dumps(record(results)) + "\n")
+        yield ChunkDone(chunk, results, time.perf_counter() - start_time)
 
 
 def record(results: dict[int, Result]) -> dict[str, Any]:
     """The content of a chunk's file. Numbers that are not finite are text: JSON has none."""
     members = {
-        str(i): {
-            "rows": [{k: v if np.isfinite(v) else str(v) for k, v in row.items()} for row in rows],
-            "diverged": why,
+        str(index): {
+            "rows": [{name: x if np.isfinite(x) else str(x) for name, x in row.items()} for row in result.rows],
+            "diverged": result.diverged,
         }
-        for i, (rows, why) in results.items()
+        for index, result in results.items()
     }
     return {"members": members, "crc32": _checksum(members)}
 
 
 def _checksum(members: Any) -> int:
-    """Detects a damaged chunk."""
     return zlib.crc32(json.dumps(members).encode())
 
 
@@ -252,8 +228,8 @@ def _recorded(path: Path) -> dict[int, Result]:
     data = json.loads(path.read_text(encoding="utf-8"))
     if data["crc32"] != _checksum(data["members"]):
         raise ValueError("damaged")
-    found = {}
+    results = {}
     for index, kept in data["members"].items():
-        rows = [{k: float(v) if isinstance(v, str) else v for k, v in row.items()} for row in kept["rows"]]
-        found[int(index)] = Result(rows, kept["diverged"])
-    return found
+        rows = [{name: float(x) if isinstance(x, str) else x for name, x in row.items()} for row in kept["rows"]]
+        results[int(index)] = Result(rows, kept["diverged"])
+    return results

@@ -61,11 +61,8 @@ def _requested_devices(environment: Mapping[str, str]) -> int:
 
 def _work(learner: Config) -> int:
     """Multiply-adds of an update's largest product."""
-    return (
-        learner.batch_size
-        * learner.unroll_length
-        * max(*learner.policy_hidden_layer_sizes, *learner.critic_hidden_layer_sizes) ** 2
-    )
+    widest = max(*learner.policy_hidden_layer_sizes, *learner.critic_hidden_layer_sizes)
+    return learner.batch_size * learner.unroll_length * widest**2
 
 
 def workers() -> list[Any]:
@@ -80,9 +77,7 @@ def workers() -> list[Any]:
 
 def _cores() -> int:
     """Cores that this process may use; a scheduler may restrict them."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def memory_bytes() -> float:
@@ -98,18 +93,20 @@ def host_bytes() -> float:
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2
 
 
-def describe_devices(run: RunConfig) -> str:
-    """The devices that a run trains on here, in words."""
+def _num_used(run: RunConfig) -> int:
     mesh = make_mesh(jax.devices(), run.seeds, run.learner.shard_count)
-    count, available = mesh.size if mesh else 1, jax.device_count()
+    return mesh.size if mesh else 1
+
+
+def describe_devices(run: RunConfig) -> str:
+    count, available = _num_used(run), jax.device_count()
     of = f" of {available}" if count < available else ""
     return f"{count}{of} {jax.default_backend()} device{'s' * (count > 1 or bool(of))}"
 
 
 def check_devices(run: RunConfig) -> None:
     """Raise BadInput if one of several processes would have no part in the run."""
-    mesh = make_mesh(jax.devices(), run.seeds, run.learner.shard_count)
-    if jax.process_count() > 1 and (mesh.size if mesh else 1) < jax.device_count():
+    if jax.process_count() > 1 and _num_used(run) < jax.device_count():
         raise BadInput(
             f"key 'num_shards': expected a multiple of the processes' {jax.device_count()} devices,"
             f" found {run.learner.shard_count}"
@@ -117,5 +114,4 @@ def check_devices(run: RunConfig) -> None:
 
 
 def device_names() -> list[str]:
-    """Names of the devices of all processes."""
     return [str(device) for device in jax.devices()]

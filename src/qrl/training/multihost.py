@@ -60,13 +60,9 @@ class Process(NamedTuple):
 
 def this_process(index: int | None, count: int | None, coordinator: str | None, env: Mapping[str, str]) -> Process:
     """From flags, else JAX's variables, else those of a SLURM step (`srun`); a single process by default."""
-    # Not SLURM_NTASKS: it is set in a batch script too, where only one process runs.
-    step = env if "SLURM_STEP_NUM_TASKS" in env else {}
-    found = [
-        ("--process-id", index, env.get("JAX_PROCESS_ID"), step.get("SLURM_PROCID")),
-        ("--processes", count, env.get("JAX_NUM_PROCESSES"), step.get("SLURM_STEP_NUM_TASKS")),
-    ]
-    index, count = (_number(flag, next((v for v in values if v is not None), None)) for flag, *values in found)
+    step = env if "SLURM_STEP_NUM_TASKS" in env else {}  # SLURM_NTASKS is set in a batch script too, for one process
+    index = _number("--process-id", index, env.get("JAX_PROCESS_ID"), step.get("SLURM_PROCID"))
+    count = _number("--processes", count, env.get("JAX_NUM_PROCESSES"), step.get("SLURM_STEP_NUM_TASKS"))
     if coordinator and count is None and index is None:
         raise BadInput("--processes is missing: expected how many there are, where there is a --coordinator")
     coordinator = coordinator or env.get("JAX_COORDINATOR_ADDRESS") or ""
@@ -79,7 +75,8 @@ def this_process(index: int | None, count: int | None, coordinator: str | None, 
     return Process(index, count, coordinator)
 
 
-def _number(flag: str, value: int | str | None) -> int | None:
+def _number(flag: str, *values: int | str | None) -> int | None:
+    value = next((v for v in values if v is not None), None)
     try:
         return None if value is None else int(value)
     except ValueError:
@@ -87,7 +84,6 @@ def _number(flag: str, value: int | str | None) -> int | None:
 
 
 def join(process: Process) -> None:
-    """Connect to the other processes, if there are any."""
     if process.of > 1 and not jax.distributed.is_initialized():
         try:
             jax.distributed.initialize(process.coordinator or None, process.of, process.number)

@@ -38,7 +38,8 @@ def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainS
     Corrupt checkpoints are quarantined; later or unfinished ones are deleted: the run makes them again. Raises
     IncompatibleCheckpoint, with nothing changed, if a checkpoint belongs to another run or version of qrl.
     """
-    one, notes = _one(target), []
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), target)
+    notes = []
     common = set.intersection(*[set(checkpoint.saved_steps(folder)) for folder in folders])
     for env_steps in sorted(common, reverse=True):
         try:
@@ -59,8 +60,7 @@ def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainS
 
 def abstract_learner(spec: LearnerSpec) -> LearnerState:
     """Shapes and types of one member's learner; no environment is traced."""
-    state = jax.eval_shape(lambda key: learner.init(spec, spec.config.hyperparameters, key), jax.random.PRNGKey(0))
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), state)
+    return jax.eval_shape(lambda key: learner.init(spec, spec.config.hyperparameters, key), jax.random.PRNGKey(0))
 
 
 def iter_learners(spec: LearnerSpec, run: RunConfig, folder: Path, most: int) -> Iterator[tuple[LearnerState, int]]:
@@ -77,8 +77,3 @@ def iter_learners(spec: LearnerSpec, run: RunConfig, folder: Path, most: int) ->
     for env_steps in saved[:most]:
         found = checkpoint.read(folder, run, env_steps, target, part=True)
         yield jax.tree.map(jnp.array, stack([found.state.learner])), found.env_steps
-
-
-def _one(states: Any) -> Any:
-    """Shapes and types of one member."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)

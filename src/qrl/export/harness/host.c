@@ -21,30 +21,19 @@ void print_text(const char *text) { fputs(text, stderr); }
 
 void finish(int code) { exit(code); }
 
-static void unmeasured(struct elapsed *elapsed) { elapsed->ticks = elapsed->spins = 0; }
-
-int call_f32(const float *obs, float *act, struct elapsed *elapsed)
+int call(enum entry entry, const void *obs, void *act, struct elapsed *elapsed)
 {
-    unmeasured(elapsed);
-    return qrl_policy_step(obs, act);
-}
-
-int call_i16(const int16_t *obs, int16_t *act, struct elapsed *elapsed)
-{
-    unmeasured(elapsed);
-    return qrl_policy_step_i16(obs, act);
-}
-
-int call_selftest(struct elapsed *elapsed)
-{
-    unmeasured(elapsed);
-    return qrl_policy_selftest();
-}
-
-void call_known(uint32_t rounds, struct elapsed *elapsed)
-{
-    (void)rounds;
-    unmeasured(elapsed);
+    elapsed->ticks = elapsed->spins = 0;
+    switch (entry) {
+    case STEP:
+        return qrl_policy_step(obs, act);
+    case STEP_I16:
+        return qrl_policy_step_i16(obs, act);
+    case SELFTEST:
+        return qrl_policy_selftest();
+    default:
+        return 0;
+    }
 }
 
 void stack_paint(void) {}

@@ -18,11 +18,10 @@ int file_close(intptr_t file);                                        /* 0 if al
 void print_text(const char *text);
 void finish(int code) __attribute__((noreturn));
 
-/* The kernel's three functions, each on its own stack, and a function of exactly 2 * rounds + 3 instructions. */
-int call_f32(const float *obs, float *act, struct elapsed *elapsed);
-int call_i16(const int16_t *obs, int16_t *act, struct elapsed *elapsed);
-int call_selftest(struct elapsed *elapsed);
-void call_known(uint32_t rounds, struct elapsed *elapsed);
+/* A measured call, on a stack of its own, of one of the kernel's functions or of KNOWN, a function of exactly
+   2 * rounds + 3 instructions with (void *)rounds for `obs`; on a host KNOWN does nothing. */
+enum entry { STEP, STEP_I16, SELFTEST, KNOWN };
+int call(enum entry entry, const void *obs, void *act, struct elapsed *elapsed);
 
 void stack_paint(void);
 int32_t stack_depth(void); /* bytes of that stack used since it was painted; 0 on a host */

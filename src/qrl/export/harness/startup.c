@@ -118,21 +118,15 @@ __asm__(".thumb_func\n"
         "    bne  1b\n"
         "2:  bx   lr\n");
 
-int call_f32(const float *obs, float *act, struct elapsed *elapsed)
+int call(enum entry entry, const void *obs, void *act, struct elapsed *elapsed)
 {
-    return timed(obs, act, (void (*)(void))qrl_policy_step, elapsed);
-}
-
-int call_i16(const int16_t *obs, int16_t *act, struct elapsed *elapsed)
-{
-    return timed(obs, act, (void (*)(void))qrl_policy_step_i16, elapsed);
-}
-
-int call_selftest(struct elapsed *elapsed) { return timed(0, 0, (void (*)(void))qrl_policy_selftest, elapsed); }
-
-void call_known(uint32_t rounds, struct elapsed *elapsed)
-{
-    timed((const void *)rounds, 0, (void (*)(void))known, elapsed);
+    static void (*const functions[])(void) = {
+        [STEP] = (void (*)(void))qrl_policy_step,
+        [STEP_I16] = (void (*)(void))qrl_policy_step_i16,
+        [SELFTEST] = (void (*)(void))qrl_policy_selftest,
+        [KNOWN] = (void (*)(void))known,
+    };
+    return timed(obs, act, functions[entry], elapsed);
 }
 
 #define PAINT 0xC5A5A5C5u
