@@ -224,7 +224,7 @@ class QuadrotorEnv(TaskEnv):
                 flight = measures.circle(observations, spec, spec.reward.radius_m, spec.reward.speed_m_s)
             return measures.summarize(flight, round(spec.tail_s / dt_s), dt_s)
 
-        return Evaluation(env, round(spec.duration_s / dt_s), spec.return_steps, measure)
+        return Evaluation(env, round(spec.duration_s / dt_s), round(spec.return_s / dt_s), measure)
 
 
 class PendulumEnv(TaskEnv):

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from qrl_envs.task import STANDARD_GRAVITY_M_S2, QuadrotorTask, Task
+from qrl_envs.task import QuadrotorTask, Task
 
 
 class ObservationPort(NamedTuple):
@@ -37,7 +37,7 @@ def observations(task: Task) -> list[ObservationPort]:
             ObservationPort("sin_theta", "1", angle),
             ObservationPort("theta_dot", "rad/s", angle),
         ]
-    origin = "the hover point" if task.reward.form == "hover" else "the circle's centre"
+    origin = "the hover point" if task.reward.form == "hover" else "the circle's center"
     rotation = [
         ObservationPort(f"r{i}{j}", "1", f"rotation matrix body -> world: world {axis} part of the body {other} axis")
         for i, axis in enumerate("xyz", 1)
@@ -57,17 +57,17 @@ def actions(task: Task) -> list[ActionPort]:
         limit, frame = task.rod.max_torque_N_m, "about the pivot, positive counter-clockwise"
         return [ActionPort("torque", "N m", frame, offset=0.0, scale=limit, low=-limit, high=limit, safe=0.0)]
     vehicle = task.vehicle
-    hover = vehicle.mass_kg * STANDARD_GRAVITY_M_S2 / 4.0
+    hover = [float(thrust) for thrust in vehicle.hover_thrusts_N]
     return [
         ActionPort(
             name=f"f{i}",
             unit="N",
             frame="thrust along body z",
-            offset=hover,
+            offset=hover[i - 1],
             scale=vehicle.action_scale_N,
             low=0.0,
             high=motor.max_N,
-            safe=min(hover, motor.max_N),
+            safe=hover[i - 1],
             position_m=motor.position_m,
             spin=motor.spin,
         )

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 from qrl_envs import integrate, rotation
-from qrl_envs.task import STANDARD_GRAVITY_M_S2, FlightStart, Vehicle
+from qrl_envs.task import FlightStart
+from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle
 
 
 class Physics(NamedTuple):
@@ -22,6 +23,7 @@ class Physics(NamedTuple):
     motor_spin: chex.Array  # [4] +1: reaction torque positive about body z
     motor_max_N: chex.Array  # [4]
     yaw_moment_m: chex.Array  # [] reaction torque per thrust
+    hover_thrust_N: chex.Array  # [4] F_o: carries the weight without torque; mg/4 each in the paper (equ:forceOutput)
     action_scale_N: chex.Array  # []
     gravity_m_s2: chex.Array  # []
 
@@ -49,6 +51,7 @@ class Start(NamedTuple):
     position_m: chex.Array  # world
     velocity_m_s: chex.Array  # world
     body_rate_rad_s: chex.Array  # body
+    tilt_rad: chex.Array  # greatest tilt from upright
 
 
 def physics(vehicle: Vehicle) -> Physics:
@@ -60,6 +63,7 @@ def physics(vehicle: Vehicle) -> Physics:
         motor_spin=jnp.asarray([m.spin for m in vehicle.motors], jnp.float32),
         motor_max_N=jnp.asarray([m.max_N for m in vehicle.motors], jnp.float32),
         yaw_moment_m=jnp.float32(vehicle.yaw_moment_m),
+        hover_thrust_N=jnp.asarray(vehicle.hover_thrusts_N, jnp.float32),
         action_scale_N=jnp.float32(vehicle.action_scale_N),
         gravity_m_s2=jnp.float32(STANDARD_GRAVITY_M_S2),
     )
@@ -70,20 +74,15 @@ def start(ranges: FlightStart) -> Start:
     return Start(*(jnp.float32(getattr(ranges, field)) for field in Start._fields))
 
 
-def hover_thrust_N(physics: Physics) -> chex.Array:
-    """F_o = mg/4, each motor's thrust in hover [N] (paper, equ:forceOutput); []."""
-    return physics.mass_kg * physics.gravity_m_s2 / 4.0
-
-
 def thrust_N(physics: Physics, action: chex.Array) -> chex.Array:
     """F = clip(F_o + action_scale·a, 0, max) of each motor [N], for an action clipped to [−1, 1]; [4] -> [4]."""
-    command = hover_thrust_N(physics) + physics.action_scale_N * jnp.clip(action, -1.0, 1.0)
+    command = physics.hover_thrust_N + physics.action_scale_N * jnp.clip(action, -1.0, 1.0)
     return jnp.clip(command, 0.0, physics.motor_max_N)
 
 
 def applied_action(physics: Physics, thrust: chex.Array) -> chex.Array:
     """The action of rewards: a = (F − F_o)/action_scale for the applied thrust F [N]; [4] -> [4]."""
-    return (thrust - hover_thrust_N(physics)) / physics.action_scale_N
+    return (thrust - physics.hover_thrust_N) / physics.action_scale_N
 
 
 def derivative(physics: Physics, body: Body, thrust: chex.Array) -> Body:
@@ -128,10 +127,10 @@ def observe(body: Body) -> chex.Array:
 
 
 def draw(start: Start, key: chex.PRNGKey) -> Body:
-    """A random start: attitude uniform over SO(3), every other coordinate uniform within ± its range."""
+    """A random start: attitude uniform within the tilt, every other coordinate uniform within ± its range."""
     u = jax.random.uniform(key, (4, 3))  # one draw, because random draws dominate the compile time of a reset
     position, velocity, rate = 2.0 * u[1:] - 1.0
     return Body(
-        Pose(start.position_m * position, rotation.uniform(u[0])),
+        Pose(start.position_m * position, rotation.uniform(u[0], start.tilt_rad)),
         Twist(start.velocity_m_s * velocity, start.body_rate_rad_s * rate),
     )

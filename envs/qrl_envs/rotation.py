@@ -41,8 +41,11 @@ def matrix(q: chex.Array) -> chex.Array:
     )
 
 
-def uniform(u: chex.Array) -> chex.Array:
-    """A rotation uniform over SO(3), as a unit quaternion [4], from u [3] uniform in [0, 1) (Shoemake 1992)."""
+def uniform(u: chex.Array, tilt_rad: chex.Array | float = jnp.pi) -> chex.Array:
+    """A rotation uniform over those that tilt z by at most `tilt_rad` (π: all of SO(3)), as a unit quaternion [4], from
+    u [3] uniform in [0, 1) (Shoemake 1992; the tilt θ has sin²(θ/2) uniform).
+    """
     a, b = 2.0 * jnp.pi * u[1], 2.0 * jnp.pi * u[2]
-    s, c = jnp.sqrt(1.0 - u[0]), jnp.sqrt(u[0])
-    return jnp.stack([s * jnp.sin(a), s * jnp.cos(a), c * jnp.sin(b), c * jnp.cos(b)])
+    squared = jnp.sin(tilt_rad / 2.0) ** 2 * u[0]
+    s, c = jnp.sqrt(squared), jnp.sqrt(1.0 - squared)
+    return jnp.stack([c * jnp.cos(b), s * jnp.sin(a), s * jnp.cos(a), c * jnp.sin(b)])

@@ -11,50 +11,17 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import Field, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.specfile import BadInput, Count, NonNegative, Positive, Real, Spec
-
-
-class Motor(Spec):
-    position_m: tuple[Real, Real]  # x, y in the body frame
-    spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about body z
-    max_N: Positive
-
-
-class Vehicle(Spec):
-    mass_kg: Positive
-    inertia_kg_m2: tuple[Positive, Positive, Positive]  # principal, about body x, y, z
-    motors: tuple[Motor, Motor, Motor, Motor]
-    yaw_moment_m: Positive  # reaction torque per thrust: N m per N
-    action_scale_N: Positive  # F_pi = action_scale_N · a
-
-    @model_validator(mode="after")
-    def _possible(self) -> "Vehicle":
-        x, y, z = self.inertia_kg_m2
-        if 2 * max(x, y, z) > (x + y + z) * (1 + 1e-9):  # equality: a flat plate
-            raise ValueError(
-                f"expected inertia_kg_m2 of a rigid body: no moment above the sum of the other two, found {x}, {y}, {z}"
-            )
-        if self.total_thrust_N <= self.mass_kg * STANDARD_GRAVITY_M_S2:
-            raise ValueError(
-                f"expected motors that can lift the vehicle, found {self.total_thrust_N:.4g} N of thrust"
-                f" for {self.mass_kg * STANDARD_GRAVITY_M_S2:.4g} N of weight"
-            )
-        return self
-
-    @property
-    def total_thrust_N(self) -> float:
-        return sum(motor.max_N for motor in self.motors)
-
-
-STANDARD_GRAVITY_M_S2 = 9.81
+from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
+from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle, shipped_vehicles, vehicle_data, with_default_scale
 
 
 class FlightStart(Spec):
-    """Start ranges: each coordinate is uniform in ±range, the attitude uniform over SO(3)."""
+    """Start ranges: each coordinate is uniform in ±range, the attitude uniform within a tilt from upright."""
 
-    position_m: NonNegative  # from the hover point or the circle's centre
+    position_m: NonNegative  # from the hover point or the circle's center
     velocity_m_s: NonNegative
     body_rate_rad_s: NonNegative
+    tilt_rad: Annotated[float, Field(gt=0.0, le=3.141592653589793)] = 3.141592653589793  # the default is all of SO(3)
 
 
 # Includes the paper's trial, which started at 6.7 m/s (its figure of a hovering trial).
@@ -84,11 +51,19 @@ class CircleReward(Spec):
     form: Literal["circle"]
     constant: Real = 0.0
     w4_distance_1_m: NonNegative
-    w5_direction_s_m2: NonNegative
+    w5_direction_s_m2: NonNegative  # in a file by default W5_RADIUS_S_M / radius_m: a speed error costs the same
     w6_action: NonNegative
     radius_m: Positive
-    speed_m_s: Positive
+    speed_m_s: Real  # above 0: counter-clockwise seen from above
 
+    @model_validator(mode="after")
+    def _moves(self) -> "CircleReward":
+        if self.speed_m_s == 0.0:
+            raise ValueError("expected a speed_m_s above 0, or below 0 for a clockwise circle, found 0")
+        return self
+
+
+W5_RADIUS_S_M = 0.5  # w5 of the 1 m circle
 
 FlightReward = Annotated[HoverReward | CircleReward, Field(discriminator="form")]
 
@@ -98,11 +73,11 @@ class FlightEvaluation(Spec):
 
     duration_s: Positive
     tail_s: Positive
-    return_steps: Count
+    return_s: Positive
     distance_m: Positive  # from the hover point, or from the circle
     speed_m_s: Positive | None = None  # circle only: |tangential speed − reward's speed|
     start: FlightStart
-    reward: FlightReward  # added up over the first `return_steps` of the flight
+    reward: FlightReward  # added up over the first `return_s` of the flight
 
     @model_validator(mode="after")
     def _consistent(self) -> "FlightEvaluation":
@@ -130,7 +105,7 @@ class QuadrotorTask(Spec):
     description: str
     preset: str  # the learner's defaults for this task
     control_period_s: Positive
-    episode_steps: Count
+    episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
     start: FlightStart
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
@@ -144,7 +119,39 @@ class QuadrotorTask(Spec):
         for name in ("form", "radius_m", "speed_m_s"):
             if getattr(train, name, None) != getattr(evaluation, name, None):
                 raise ValueError(f"expected reward.{name} and evaluation.reward.{name} to be the same")
+        if isinstance(train, CircleReward):
+            self._check_circle(train)
+        for where, start in (("start", self.start), ("evaluation.start", self.evaluation.start)):
+            reach = 3**0.5 * start.position_m
+            if reach >= self.bounds.distance_m:
+                raise ValueError(
+                    f"expected bounds.distance_m beyond the starts, which reach {reach:.3g} m ({where}.position_m ="
+                    f" {start.position_m:g} along each axis), found {self.bounds.distance_m:g}"
+                )
         return _periods_fit(self)
+
+    def _check_circle(self, circle: CircleReward) -> None:
+        needed = circle.speed_m_s**2 / circle.radius_m
+        lift = self.vehicle.total_thrust_N / self.vehicle.mass_kg
+        can = (lift**2 - STANDARD_GRAVITY_M_S2**2) ** 0.5
+        if needed > can:
+            raise ValueError(
+                f"expected a circle that the vehicle can fly: {abs(circle.speed_m_s):g} m/s on {circle.radius_m:g} m"
+                f" takes {needed:.3g} m/s² toward the center, and its thrust allows {can:.3g}"
+            )
+        if circle.radius_m >= self.bounds.distance_m:
+            raise ValueError(
+                f"expected bounds.distance_m beyond the circle's radius of {circle.radius_m:g} m,"
+                f" found {self.bounds.distance_m:g}"
+            )
+
+    @property
+    def episode_steps(self) -> int:
+        return max(1, round(self.episode_s / self.control_period_s))
+
+    def warnings(self) -> list[str]:
+        """What is accepted and may not work, in one line each."""
+        return [f"vehicle: {text}" for text in self.vehicle.warnings()]
 
 
 class PendulumStart(Spec):
@@ -185,7 +192,7 @@ class PendulumTask(Spec):
     description: str
     preset: str
     control_period_s: Positive
-    episode_steps: Count
+    episode_s: Positive
     rod: Rod
     start: PendulumStart
     reward: PendulumReward
@@ -194,6 +201,14 @@ class PendulumTask(Spec):
     @model_validator(mode="after")
     def _consistent(self) -> "PendulumTask":
         return _periods_fit(self)
+
+    @property
+    def episode_steps(self) -> int:
+        return max(1, round(self.episode_s / self.control_period_s))
+
+    def warnings(self) -> list[str]:
+        """What is accepted and may not work, in one line each."""
+        return []
 
 
 Task = QuadrotorTask | PendulumTask
@@ -216,18 +231,57 @@ def _shipped(name: str) -> dict[str, Any]:
     return extended(specfile.read(Path(str(resources.files("qrl_envs").joinpath("tasks", f"{name}.json")))), name)
 
 
-def load(name_or_path: str) -> Task:
-    """The task of a shipped name or of a `.json` file; raises BadInput with a message of one line."""
+def load(name_or_path: str, vehicle: str | None = None) -> Task:
+    """The task of a shipped name or of a `.json` file, with the `vehicle` of that name or file where one is given.
+
+    Raises BadInput with a message of one line.
+    """
     if name_or_path in shipped():
-        return specfile.build(_ANY_TASK, _shipped(name_or_path), name_or_path)
+        return from_data(_shipped(name_or_path), name_or_path, vehicle=vehicle)
     if name_or_path.endswith(".json"):
-        return from_data(specfile.read(Path(name_or_path)), name_or_path)
+        path = Path(name_or_path)
+        return from_data(specfile.read(path), name_or_path, path.parent, vehicle)
     raise BadInput(f"unknown task '{name_or_path}'{specfile.nearest(name_or_path, shipped())}")
 
 
-def from_data(data: dict[str, Any], where: str) -> Task:
-    """The task of a JSON object, which may `extend` a shipped task; error messages begin with `where`."""
-    return specfile.build(_ANY_TASK, extended(data, where), where)
+def from_data(data: dict[str, Any], where: str, folder: Path = Path(), vehicle: str | None = None) -> Task:
+    """The task of a JSON object, which may `extend` a shipped task; error messages begin with `where`.
+
+    Its key `vehicle` may be an object, a shipped vehicle's name or a `.json` path, from `folder` on; the argument
+    `vehicle`, a name or path, replaces it.
+    """
+    data = extended(data, where)
+    named = data.get("vehicle")
+    if vehicle is not None:
+        if data.get("world") != "quadrotor":
+            raise BadInput(f"{where}: has no vehicle to replace by '{vehicle}'")
+        data = {**data, "vehicle": vehicle_data(vehicle)}
+        where = f"{where} with vehicle {vehicle}"
+    elif isinstance(named, str):
+        path = named if named in shipped_vehicles() else str(folder / named)
+        try:
+            data = {**data, "vehicle": vehicle_data(path)}
+        except BadInput as error:
+            raise BadInput(f"{where}: key 'vehicle': {error}") from None
+    return specfile.build(_ANY_TASK, _completed(data), where)
+
+
+def _completed(data: dict[str, Any]) -> dict[str, Any]:
+    """A task object with the values that follow from others, and its durations, which the first version counted in
+    steps, in seconds.
+    """
+    evaluation = dict(part) if isinstance(part := data.get("evaluation"), dict) else part
+    data = data | {"evaluation": evaluation} if "evaluation" in data else dict(data)
+    period = data.get("control_period_s")
+    for part, former, name in ((data, "episode_steps", "episode_s"), (evaluation, "return_steps", "return_s")):
+        if isinstance(part, dict) and isinstance(period, int | float) and isinstance(part.get(former), int):
+            part[name] = part.pop(former) * period
+    for part in (data, evaluation):
+        reward = part.get("reward") if isinstance(part, dict) else None
+        radius = reward.get("radius_m") if isinstance(reward, dict) else None
+        if isinstance(radius, int | float) and radius > 0 and reward.get("w5_direction_s_m2") is None:
+            part["reward"] = reward | {"w5_direction_s_m2": W5_RADIUS_S_M / radius}
+    return data | {"vehicle": with_default_scale(data["vehicle"])} if "vehicle" in data else data
 
 
 def extended(data: dict[str, Any], where: str) -> dict[str, Any]:

@@ -101,7 +101,7 @@ def physics(lanes: int, key: jax.Array) -> None:
     draw = jax.vmap(jax.vmap(lambda k: quadrotor.draw(params.start, k)))
     bodies = draw(jax.random.split(key, (blocks, lanes // blocks)))
     about = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
-    thrusts = quadrotor.hover_thrust_N(params.physics) * about
+    thrusts = params.physics.hover_thrust_N * about
     if mesh:
         bodies, thrusts = jax.device_put((bodies, thrusts), NamedSharding(mesh, P(SHARD)))
     step = partial(jax.jit(steps, compiler_options=xla_effort(1)), jax.tree.map(jnp.asarray, params.physics), thrusts)

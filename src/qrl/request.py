@@ -27,24 +27,33 @@ def config_file(path: Path | None) -> ConfigFile:
 
 
 def run_config(
-    task: str | None, config: Path | None, file: ConfigFile, flags: dict[str, Any], seed: int | None, seeds: int | None
+    task: str | None,
+    config: Path | None,
+    file: ConfigFile,
+    flags: dict[str, Any],
+    seed: int | None,
+    seeds: int | None,
+    vehicle: str | None = None,
+    preset: str | None = None,
 ) -> RunConfig:
-    """The run asked for: flags over CONFIG (`file`, read from `config`) over the task's preset over the default.
+    """The run asked for: flags over CONFIG (`file`, read from `config`) over `preset`, or the task's, over the default.
 
     It names no devices yet: JAX has not been asked for them.
     """
     record = file.task
     assert not isinstance(record, str)  # config_file saw to it
     if task:
-        asked = tasks.task_record(task)
+        asked = tasks.task_record(task, vehicle)
         if record and record != asked:
             raise BadInput(f"{config}: key 'task': expected the task asked for, '{task}', found '{record.name}'")
         record = asked
+    elif vehicle:
+        raise BadInput("--vehicle: expected a TASK to fly it")
     if not record:
         raise BadInput(f"no task given (known: {', '.join(shipped())}; all: qrl tasks)")
     run = RunConfig(
         task=record,
-        learner=_learner(record, task or str(config), config, file.learner, flags),
+        learner=_learner(record, task or str(config), config, file.learner, flags, preset),
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=records.versions(),
@@ -54,9 +63,14 @@ def run_config(
 
 
 def _learner(
-    record: TaskRecord, where: str, config: Path | None, learner: dict[str, Any], flags: dict[str, Any]
+    record: TaskRecord,
+    where: str,
+    config: Path | None,
+    learner: dict[str, Any],
+    flags: dict[str, Any],
+    preset: str | None,
 ) -> Config:
-    base = tasks.task_preset(record, where) | learner
+    base = tasks.task_preset(record, "--preset" if preset else where, preset) | learner
     file = f"{config}: learner" if config else f"preset of {record.name}"
     try:
         return specfile.build(Config, base | flags, "command line")

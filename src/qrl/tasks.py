@@ -10,6 +10,7 @@ from types import ModuleType
 from typing import Any
 
 import jax
+import numpy as np
 
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.types import Env
@@ -19,6 +20,8 @@ from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput
+
+PRESET_PERIOD_S = {"quadrotor": 0.01, "pendulum": 0.05}  # control periods that the presets are made for
 
 
 def _brax_envs() -> ModuleType:
@@ -34,8 +37,13 @@ def foreign_tasks() -> list[str]:
     return sorted(set(_brax_envs()._envs) - set(task_spec.shipped()))  # Brax offers no public list
 
 
-def task_record(name: str) -> TaskRecord:
-    """The task of a shipped name, a `.json` path, one of Brax's names, or "module:factory"."""
+def task_record(name: str, vehicle: str | None = None) -> TaskRecord:
+    """The task of a shipped name, a `.json` path, one of Brax's names, or "module:factory"; of a task of our own worlds
+    with the `vehicle` of that name or file, where one is given.
+    """
+    own = name in task_spec.shipped() or name.endswith(".json")
+    if vehicle is not None and not own:
+        raise BadInput(f"task '{name}': has no vehicle to replace by '{vehicle}'")
     if ":" in name and not name.endswith(".json"):
         _call_factory(name)
         return TaskRecord(name=name, spec=None)
@@ -43,8 +51,9 @@ def task_record(name: str) -> TaskRecord:
         if name in foreign_tasks():
             return TaskRecord(name=name, spec=None)
         raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*task_spec.shipped(), *foreign_tasks()])}")
-    spec = task_spec.load(name).model_dump(mode="json", exclude_none=True)
-    return TaskRecord(name=_folder(Path(name).stem, name), spec=spec)
+    spec = task_spec.load(name, vehicle).model_dump(mode="json", exclude_none=True)
+    stem = Path(name).stem + (f"_{Path(vehicle).stem}" if vehicle else "")
+    return TaskRecord(name=_folder(stem, name), spec=spec)
 
 
 def _call_factory(name: str) -> Env:
@@ -130,9 +139,29 @@ def preset(name: str, where: str) -> dict[str, Any]:
         raise BadInput(f"{where}: {error}") from None
 
 
-def task_preset(record: TaskRecord, where: str) -> dict[str, Any]:
-    """The learner's defaults for a task, which `where` names."""
-    return preset(record.spec["preset"] if record.spec else "default", f"{where}: the task's key 'preset'")
+def task_preset(record: TaskRecord, where: str, name: str | None = None) -> dict[str, Any]:
+    """The learner's defaults for a task, which `where` names: its preset, or that of `name`, carried over to it."""
+    if record.spec is None:
+        return preset(name or "default", where)
+    values = preset(name or record.spec["preset"], where if name else f"{where}: the task's key 'preset'")
+    return _carried_over(values, spec(record))
+
+
+def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any]:
+    """A preset made for the shipped task of its world, for another one: durations keep their seconds at another control
+    period, and scales follow the size and the speed of a circle.
+    """
+    rate = PRESET_PERIOD_S[task.world] / task.control_period_s
+    steps = ("num_timesteps", "episode_length", "unroll_length", "apg_episode_length")
+    values = values | {name: max(1, round(values[name] * rate)) for name in steps if values[name]}
+    values["gamma"] = float(values["gamma"]) ** (1.0 / rate)
+    reward = task.reward
+    if isinstance(reward, task_spec.CircleReward) and values["observation_scale"]:
+        length, speed = max(1.0, reward.radius_m), max(1.0, abs(reward.speed_m_s) / 2.0)
+        rotation, position, velocity, rates = np.split(np.array(values["observation_scale"]), [9, 12, 15])
+        scale = np.concatenate([rotation, position / length, velocity / speed, rates])
+        values |= {"observation_scale": scale.tolist(), "reward_scaling": values["reward_scaling"] / length}
+    return values
 
 
 def check(env: Env, learner: Config, where: str) -> None:

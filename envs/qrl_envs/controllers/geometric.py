@@ -16,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from qrl_envs.controllers.mixer import action, mixer
-from qrl_envs.task import STANDARD_GRAVITY_M_S2, CircleReward, HoverReward, QuadrotorTask
+from qrl_envs.task import CircleReward, HoverReward, QuadrotorTask
+from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2
 
 TINY = 1e-6
 

@@ -25,7 +25,8 @@ import scipy.linalg
 
 from qrl_envs import quadrotor, rotation
 from qrl_envs.quadrotor import Body, Pose, Twist
-from qrl_envs.task import STANDARD_GRAVITY_M_S2, CircleReward, HoverReward, QuadrotorTask
+from qrl_envs.task import CircleReward, HoverReward, QuadrotorTask
+from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2
 
 Array = Any  # NumPy's in the design, JAX's in the controller
 
@@ -110,7 +111,7 @@ def linearize(task: QuadrotorTask) -> LinearModel:
         """The error [12] after a step from the error delta[:12] under trim.action + delta[12:]."""
         body, action = _perturbed(trim, delta)
         # Not clipped: a motor whose trim thrust is at a limit still needs a derivative.
-        thrust = quadrotor.hover_thrust_N(physics) + physics.action_scale_N * action
+        thrust = physics.hover_thrust_N + physics.action_scale_N * action
         return _error(trim, quadrotor.observe(quadrotor.step(physics, body, thrust, dt_s)), on_circle)
 
     @functools.partial(jax.jit, compiler_options=_fast_compile())
@@ -140,7 +141,7 @@ def _fast_compile() -> dict[str, int]:
 
 
 def _initial_trim(task: QuadrotorTask) -> Trim:
-    """The continuous-time trim of a vehicle with equal motors: the initial guess of Newton's method."""
+    """The continuous-time trim, without the torque that turning takes: the initial guess of Newton's method."""
     level, zero = np.array([1.0, 0.0, 0.0, 0.0], np.float32), np.zeros(3, np.float32)
     if not isinstance(reward := task.reward, CircleReward):
         return Trim(zero, zero, level, zero, np.zeros(4, np.float32))
@@ -152,8 +153,7 @@ def _initial_trim(task: QuadrotorTask) -> Trim:
         np.array([0.0, reward.speed_m_s, 0.0], np.float32),
         np.array([c, s, s, c], np.float32),
         np.array([0.0, turn_rate * np.sin(roll), turn_rate * np.cos(roll)], np.float32),
-        np.full(4, (1.0 / np.cos(roll) - 1.0) * task.vehicle.mass_kg * STANDARD_GRAVITY_M_S2 / 4.0, np.float32)
-        / np.float32(task.vehicle.action_scale_N),
+        np.float32((1.0 / np.cos(roll) - 1.0) * task.vehicle.hover_thrusts_N / task.vehicle.action_scale_N),
     )
 
 

@@ -6,7 +6,7 @@ import chex
 import jax.numpy as jnp
 import numpy as np
 
-from qrl_envs.task import STANDARD_GRAVITY_M_S2, Vehicle
+from qrl_envs.vehicle import Vehicle
 
 
 class Mixer(NamedTuple):
@@ -15,7 +15,7 @@ class Mixer(NamedTuple):
     thrust_per_wrench: np.ndarray  # [4 motors, 4]: per lift, and per torque about x, y, z
     low_N: np.ndarray  # [4] limits of the thrust that actions command
     high_N: np.ndarray  # [4]
-    hover_N: np.ndarray  # []
+    hover_N: np.ndarray  # [4] thrusts of hover
     action_scale_N: np.ndarray  # []
 
     @property
@@ -37,10 +37,10 @@ def mixer(vehicle: Vehicle) -> Mixer:
     x, y = np.array([motor.position_m for motor in vehicle.motors]).T
     spin, max_N = np.array([(motor.spin, motor.max_N) for motor in vehicle.motors]).T
     wrench_per_thrust = np.stack([np.ones(4), y, -x, vehicle.yaw_moment_m * spin])
-    hover = vehicle.mass_kg * STANDARD_GRAVITY_M_S2 / 4.0
+    hover = vehicle.hover_thrusts_N
     numbers = (
         np.linalg.pinv(wrench_per_thrust),
-        np.full(4, max(hover - vehicle.action_scale_N, 0.0)),
+        np.maximum(hover - vehicle.action_scale_N, 0.0),
         np.minimum(hover + vehicle.action_scale_N, max_N),
         hover,
         vehicle.action_scale_N,

@@ -69,6 +69,9 @@ def build_parser() -> _Parser:
     train = commands.add_parser("train", help="train a policy and write a run folder")
     task = "name (see qrl tasks), .json file, or module:factory of your environment"
     train.add_argument("task", nargs="?", metavar="TASK", help=task)
+    train.add_argument(
+        "--vehicle", metavar="VEHICLE", help="a shipped vehicle's name or a .json file (default: the task's own)"
+    )
     train.add_argument("--seed", type=whole_number, metavar="N", help="first seed (default 0)")
     train.add_argument("--seeds", type=count, metavar="N", help="number of seeds, trained in one program (default 1)")
     train.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default runs/TASK)")

@@ -23,6 +23,7 @@ from qrl.training import devices, loop, multihost
 from qrl_envs.specfile import BadInput
 
 PICTURE_FLIGHTS = 5
+FLIES = 0.99  # success from which a policy is said to do its task
 _HEADER = f"{'steps':>12} {'steps/s':>10} {'return':>20} {'success':>16} {'train time':>10} {'ETA':>6}"
 
 
@@ -71,9 +72,7 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     """What to train, and where; None: it is complete. The folder is locked until `stack` closes."""
     flags = _flags(args)
     file = request.config_file(args.config)
-    if args.preset:
-        file = file.model_copy(update={"learner": tasks.preset(args.preset, "--preset") | file.learner})
-    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds)
+    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds, args.vehicle, args.preset)
     out: Path = args.out or Path("runs") / tasks.folder_name(config.task)
     if out.exists() and not out.is_dir():
         raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
@@ -92,6 +91,8 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
         config = config.model_copy(update={"devices": devices.device_names()})
     elif changed := request.changed_since(config):
         console.print(f"environment changed since the run began; results may not be bit-identical: {changed}")
+    for warning in tasks.spec(config.task).warnings() if config.task.spec else []:
+        print_error(f"warning: {config.task.name}: {warning}")
     where = "command line" if "observation_scale" in flags else str(args.config or config.task.name)
     tasks.check(tasks.environment(config.task), config.learner, where)
     devices.check_devices(config)
@@ -156,7 +157,8 @@ def write_results(plan: Plan, finished: loop.Finished, seconds: float) -> None:
             shown = np.asarray(finished.flights.observations[i, :PICTURE_FLIGHTS])
             with files.writing(folder / "flight.png"):
                 flights.draw(folder / "flight.png", tasks.spec(config.task), shown)
-        files.write_json(folder / "summary.json", {"result": history[i][-1], "command_seconds": round(seconds, 1)})
+        summary = {"result": history[i][-1], "flies": flies(history[i][-1]), "command_seconds": round(seconds, 1)}
+        files.write_json(folder / "summary.json", summary)
     if len(folders) > 1:
         title = f"{config.task.name}, {len(folders)} seeds"
         with files.writing(out / "learning_curve.png"):
@@ -169,6 +171,24 @@ def write_results(plan: Plan, finished: loop.Finished, seconds: float) -> None:
         }
         files.write_json(out / "summary.json", {"seeds": spread, "command_seconds": round(seconds, 1)})
     console.print(f"done in {clock(seconds)}: {out}/summary.json, learning_curve.png; next: make evaluate RUN={out}")
+    for i, rows in enumerate(history):
+        if flies(rows[-1]) is False:
+            console.print(f"seed {config.seed + i} {_shortfall(rows[-1], config.learner)}")
+
+
+def flies(last: Row) -> bool | None:
+    """Whether the last report's policy does its task from nearly every start; None where success is not measured."""
+    return None if np.isnan(last["success"]) else bool(last["success"] >= FLIES)
+
+
+def _shortfall(last: Row, config: Config) -> str:
+    """What a policy that does not do its task does, and what to try."""
+    ends = f", and {last['ended_early']:.0%} of its episodes left the bounds" if last["ended_early"] > 0.01 else ""
+    longer = f"--num-timesteps {2 * config.num_timesteps}"
+    return (
+        f"does its task from {last['success']:.0%} of the reports' starts only{ends}. To try: {longer}, another SEED,"
+        " starts within a tilt (start.tilt_rad in the task file), a vehicle with more thrust"
+    )
 
 
 def _describe_steps(config: Config) -> str:

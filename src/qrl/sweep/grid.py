@@ -70,7 +70,7 @@ class GridPoint:
         plan = spec["evaluation"]
         return flights | {
             "control period of its flights": spec["control_period_s"],
-            "number of steps of its return": plan.get("return_steps", spec["episode_steps"]),
+            "duration of its return": plan.get("return_s", spec["episode_s"]),
             "start of its flights": plan.get("start", spec["start"]),
             "reward of its return": plan.get("reward", spec["reward"]),
             "evaluation": plan,
