@@ -32,7 +32,7 @@ ROWS = {
     " for the policy's update and the critic's, as if they were the present policy's; so this is V-trace off, too",
     "condition 1": "(π − μ)·A^μ, from the same uncorrected returns",
     "constant margin": "ξ in the place of ε|A|, with ξ = ε: A has a root mean square of 1",
-    "on-policy PPO": "condition 2 on the last unroll alone, GAE(0.95)",
+    "PPO": "whole passes over the last unroll, advantages fixed at their start, GAE(0.95), no symmetries",
     "V-trace's clips off": "importance ratios as they are, ρ̄ and c̄ = 10⁶",
     "no symmetries": "ours, without turned and mirrored trajectories (not of the paper)",
 }

@@ -79,6 +79,10 @@ class Config(BaseModel):
         " divides it; null: 8, or the largest that num_envs and batch_size allow"
     )
 
+    sampling: Static[Literal["replay", "epochs"]] = Field(
+        description="minibatches: replay draws with replacement from the buffer; epochs, as PPO, makes whole passes"
+        " over the last unroll in random order, with advantages fixed at their start"
+    )
     symmetries: Static[bool] = Field(
         description="transform each trajectory of a minibatch by a random symmetry of the task (data augmentation)"
     )
@@ -137,6 +141,14 @@ class Config(BaseModel):
                 f"expected num_timesteps of at least warmup_unrolls · num_envs · unroll_length = {least:,}{before},"
                 f" found {found:,}"
             )
+        if self.sampling == "epochs":
+            if self.advantage != "mu" or self.replay_unrolls != 1 or self.symmetries:
+                raise ValueError("expected advantage mu, replay_unrolls 1 and symmetries false with sampling epochs")
+            if self.updates_per_unroll * self.batch_size % self.num_envs or self.num_envs % self.batch_size:
+                raise ValueError(
+                    "expected updates_per_unroll minibatches of batch_size trajectories that make whole passes over"
+                    f" num_envs = {self.num_envs} with sampling epochs"
+                )
         for name in ("num_envs", "batch_size", *(["apg_num_envs"] if self.num_apg_updates else [])):
             if (value := getattr(self, name)) % self.shard_count:
                 raise ValueError(f"expected {name} to be a multiple of num_shards = {self.shard_count}, found {value}")

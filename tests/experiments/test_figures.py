@@ -414,11 +414,11 @@ def test_the_ablations_table_is_the_sweeps(tmp_path: Path) -> None:
     (tmp_path / "results.csv").write_text(
         "point,objective,seed,diverged,return_mean,success\n"
         "0,ours,0,,-150.04,1.0\n0,ours,1,,-160,0.5\n0,ours,2,,-140,1\n"
-        "1,on-policy PPO,0,,-900,0\n1,on-policy PPO,1,value at step 7,-1,1\n1,on-policy PPO,2,,-800,0.25\n"
+        "1,PPO,0,,-900,0\n1,on-policy PPO,1,value at step 7,-1,1\n1,on-policy PPO,2,,-800,0.25\n"
     )
     page = ablation.page({"pendulum": ablation.rows(tmp_path), "hover": {}})
     assert "| ours | -150.0 [-160.0 … -140.0] | 100 [50 … 100] | – | – |" in page
-    assert "| on-policy PPO | -900.0 [-inf … -800.0]; 1 of 3 diverged | 0 [0 … 25] | – | – |" in page
+    assert "| PPO | -900.0 [-inf … -800.0]; 1 of 3 diverged | 0 [0 … 25] | – | – |" in page
     assert "hover: 640,000 steps, 5 seeds" in page
 
 
@@ -428,7 +428,7 @@ def test_both_grids_hold_the_rows_that_the_table_explains(name: str) -> None:
     assert file["axes"]["objective"].keys() == ablation.ROWS.keys()
     preset = load_preset(name) | file["fixed"]
     assert file["axes"]["objective"]["constant margin"]["xi"] == preset["epsilon"]
-    assert file["axes"]["objective"]["on-policy PPO"] == figure_runs.PPO
+    assert file["axes"]["objective"]["PPO"] == figure_runs.PPO
 
 
 def test_a_stale_sweep_is_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

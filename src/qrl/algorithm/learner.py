@@ -128,15 +128,21 @@ def update_statistics(
     return state._replace(statistics=running_statistics.update(state.statistics, batch, spec.axis))
 
 
+class Targets(NamedTuple):
+    a_trace: chex.Array  # [..., T] advantages
+    v_trace: chex.Array  # [..., T] targets of V
+
+
 def update(
-    spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, batch: Transition
+    spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, batch: Transition, targets: Targets | None = None
 ) -> tuple[LearnerState, UpdateMetrics]:
     """One step of both networks on a minibatch of trajectories (leaves [B, T, ...]).
 
-    Over several devices (`spec.axis`) each has an equal part of the minibatch, and all get the same result.
+    `targets` [B, T] are those of the trajectories, fixed, as PPO has them; without, they are computed from the present
+    networks. Over several devices (`spec.axis`) each has an equal part of the minibatch, and all get the same result.
     """
     loss = functools.partial(_loss, spec, hyper)
-    gradient, metrics = mean_over_devices(spec, jax.grad(loss, has_aux=True)(state.params, state, batch))
+    gradient, metrics = mean_over_devices(spec, jax.grad(loss, has_aux=True)(state.params, state, batch, targets))
     if spec.config.normalize_advantage and not _normalizes_in_loss(spec, hyper):
         divisor = _rms(metrics.a_trace)
         gradient = gradient._replace(policy=jax.tree.map(lambda x: x / divisor, gradient.policy))
@@ -180,8 +186,25 @@ def _optimizer(hyper: Hyperparameters) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(hyper.max_grad_norm), optax.scale_by_adam())
 
 
+def targets_of(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, batch: Transition) -> Targets:
+    """A^trace and V^trace of trajectories (leaves [B, T, ...]) under the present networks; constants."""
+    observation = preprocess(spec, hyper, state, _flat(batch.observation))
+    samples = batch.reward.shape
+    value = networks.apply(spec.critic, state.params.critic, observation).reshape(samples)
+    log_rho = jnp.zeros(samples)
+    if spec.config.advantage == "pi":
+        mean = networks.apply(spec.policy, state.params.policy, observation)
+        log_rho = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples) - batch.log_mu
+    return jax.lax.stop_gradient(_targets(spec, hyper, state, state.params.critic, value, log_rho, batch))
+
+
 def _loss(
-    spec: LearnerSpec, hyper: Hyperparameters, params: Networks, state: LearnerState, batch: Transition
+    spec: LearnerSpec,
+    hyper: Hyperparameters,
+    params: Networks,
+    state: LearnerState,
+    batch: Transition,
+    targets: Targets | None = None,
 ) -> tuple[chex.Array, UpdateMetrics]:
     """Sum of the policy's and the critic's loss; metrics hold A^trace's mean square."""
     samples = batch.reward.shape
@@ -191,12 +214,7 @@ def _loss(
     log_pi = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples)
     log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
 
-    reward = hyper.reward_scaling * batch.reward
-    next_value = _bootstrap_values(spec, hyper, state, params.critic, value, reward, batch)
-    # No policy's value is beyond what the extreme rewards pay forever: with this bound V cannot run away.
-    low, high = hyper.reward_scaling * state.reward_range * _horizon(hyper)
-    value_bounded, next_value = (jnp.clip(x, low, high) for x in (value, next_value))
-    a_trace, v_trace = _targets(spec, hyper, reward, value_bounded, next_value, log_rho, batch)
+    a_trace, v_trace = targets or _targets(spec, hyper, state, params.critic, value, log_rho, batch)
     square = jnp.mean(a_trace**2)
     if _normalizes_in_loss(spec, hyper):
         square = mean_over_devices(spec, square)
@@ -253,20 +271,25 @@ def _horizon(hyper: Hyperparameters) -> chex.Array:
 def _targets(
     spec: LearnerSpec,
     hyper: Hyperparameters,
-    reward: chex.Array,
+    state: LearnerState,
+    critic: chex.ArrayTree,
     value: chex.Array,
-    next_value: chex.Array,
     log_rho: chex.Array,
     batch: Transition,
-) -> tuple[chex.Array, chex.Array]:
-    """(A^trace, V^trace) of trajectories, each [B, T]."""
+) -> Targets:
+    """A^trace and V^trace of trajectories [B, T]; `value` [B, T] is the critic's of their observations."""
+    reward = hyper.reward_scaling * batch.reward
+    next_value = _bootstrap_values(spec, hyper, state, critic, value, reward, batch)
+    # No policy's value is beyond what the extreme rewards pay forever: with this bound V cannot run away.
+    low, high = hyper.reward_scaling * state.reward_range * _horizon(hyper)
+    value, next_value = (jnp.clip(x, low, high) for x in (value, next_value))
     # A^mu needs no correction for the difference between pi and mu; with rho = 1 the trace is GAE(lambda).
     off_policy = spec.config.advantage == "pi"
     rho = jnp.exp(log_rho) if off_policy else jnp.ones_like(log_rho)
     clips = {"rho_bar": hyper.rho_bar, "c_bar": hyper.c_bar} if off_policy else {"rho_bar": 1.0, "c_bar": 1.0}
     trace = functools.partial(vtrace, gamma=hyper.gamma, lam=hyper.lam, **clips)
     constant = jax.lax.stop_gradient(value)
-    return jax.vmap(trace)(reward, constant, next_value, batch.terminated, batch.truncated, rho)
+    return Targets(*jax.vmap(trace)(reward, constant, next_value, batch.terminated, batch.truncated, rho))
 
 
 def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, batch: Transition) -> chex.Array:

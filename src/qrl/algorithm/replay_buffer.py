@@ -50,6 +50,23 @@ def sample(buffer: ReplayBuffer, keys: chex.PRNGKey, minibatches: int, each: int
     return jnp.swapaxes(index, 0, 1).reshape(minibatches, -1)
 
 
+def epochs(buffer: ReplayBuffer, keys: chex.PRNGKey, minibatches: int, each: int) -> chex.Array:
+    """Indices of trajectories as `sample` gives, but whole passes over each shard's lanes in the newest slot, each in a
+    random order without replacement; `minibatches`·`each` must be a multiple of a shard's lanes.
+    """
+    slots, lanes = jax.tree.leaves(buffer.data)[0].shape[:2]
+    width = lanes // keys.shape[0]
+    passes = minibatches * each // width
+
+    def one(key: chex.PRNGKey) -> chex.Array:
+        orders = jax.vmap(lambda key: jax.random.permutation(key, width))(jax.random.split(key, passes))
+        return orders.reshape(minibatches, each)
+
+    first = jnp.arange(keys.shape[0], dtype=jnp.int32)[:, None, None] * width
+    index = (buffer.inserted - 1) % slots * lanes + first + jax.vmap(one)(keys)
+    return jnp.swapaxes(index, 0, 1).reshape(minibatches, -1)
+
+
 def gather(buffer: ReplayBuffer, index: chex.Array) -> chex.ArrayTree:
     """The trajectories at `index` [B]; leaves [B, T, ...]."""
     return jax.tree.map(lambda d: d.reshape(-1, *d.shape[2:])[index], buffer.data)

@@ -140,18 +140,25 @@ def _updates(
     """The updates of one unroll on augmented minibatches, and their metrics [updates, len(UpdateMetrics)]."""
     config, env = setup.config, setup.env_of(inputs)
 
+    targets: Any = None  # or, of all trajectories in the buffer, those that stay fixed during the updates
+    if config.sampling == "epochs":
+        lanes = jax.tree.map(lambda x: x[0], buffer.data)  # of the only slot
+        targets = learner.targets_of(setup.spec, inputs.hyper, state, lanes)
+
     def one(now: LearnerState, sample: tuple[chex.Array, chex.Array]) -> tuple[LearnerState, chex.Array]:
         index, draws = sample
         batch = replay_buffer.gather(buffer, index)
         if config.symmetries:
             batch = augmentation.augment(env, batch, draws)
-        now, metrics = learner.update(setup.spec, inputs.hyper, now, batch)
+        fixed = jax.tree.map(lambda x: x[index], targets)
+        now, metrics = learner.update(setup.spec, inputs.hyper, now, batch, fixed)
         return now, jnp.stack(metrics)
 
     shard_ids = sharding.local_indices(setup.mesh, config.shard_count)
     keys = jax.vmap(lambda shard: jax.random.split(jax.random.fold_in(key, shard)))(shard_ids)
     each = config.batch_size // config.shard_count
-    index = replay_buffer.sample(buffer, keys[:, 0], config.updates_per_unroll, each)
+    draw = replay_buffer.epochs if config.sampling == "epochs" else replay_buffer.sample
+    index = draw(buffer, keys[:, 0], config.updates_per_unroll, each)
     return jax.lax.scan(one, state, (index, augmentation.sample(keys[:, 1], config.updates_per_unroll, each)))
 
 
