@@ -228,7 +228,8 @@ def shipped() -> list[str]:
 
 
 def _shipped(name: str) -> dict[str, Any]:
-    return extended(specfile.read(Path(str(resources.files("qrl_envs").joinpath("tasks", f"{name}.json")))), name)
+    data = extended(specfile.read(Path(str(resources.files("qrl_envs").joinpath("tasks", f"{name}.json")))), name)
+    return data | {"vehicle": vehicle_data(named)} if isinstance(named := data.get("vehicle"), str) else data
 
 
 def load(name_or_path: str, vehicle: str | None = None) -> Task:
@@ -266,6 +267,10 @@ def from_data(data: dict[str, Any], where: str, folder: Path = Path(), vehicle: 
     return specfile.build(_ANY_TASK, _completed(data), where)
 
 
+def _positive(value: Any) -> bool:
+    return isinstance(value, int | float) and 0 < value < 1e9
+
+
 def _completed(data: dict[str, Any]) -> dict[str, Any]:
     """A task object with the values that follow from others, and its durations, which the first version counted in
     steps, in seconds.
@@ -274,12 +279,12 @@ def _completed(data: dict[str, Any]) -> dict[str, Any]:
     data = data | {"evaluation": evaluation} if "evaluation" in data else dict(data)
     period = data.get("control_period_s")
     for part, former, name in ((data, "episode_steps", "episode_s"), (evaluation, "return_steps", "return_s")):
-        if isinstance(part, dict) and isinstance(period, int | float) and isinstance(part.get(former), int):
+        if isinstance(part, dict) and isinstance(period, int | float) and _positive(part.get(former)):
             part[name] = part.pop(former) * period
     for part in (data, evaluation):
         reward = part.get("reward") if isinstance(part, dict) else None
         radius = reward.get("radius_m") if isinstance(reward, dict) else None
-        if isinstance(radius, int | float) and radius > 0 and reward.get("w5_direction_s_m2") is None:
+        if _positive(radius) and reward.get("w5_direction_s_m2") is None:
             part["reward"] = reward | {"w5_direction_s_m2": W5_RADIUS_S_M / radius}
     return data | {"vehicle": with_default_scale(data["vehicle"])} if "vehicle" in data else data
 

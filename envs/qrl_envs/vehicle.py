@@ -15,6 +15,7 @@ INERTIA_TOLERANCE = 0.05  # measured inertias are rounded: excess over a rigid b
 MOST_ARM_PER_GYRATION = 30.0  # distance of a motor per radius of gyration, above which a length has a wrong unit
 LEAST_ANGULAR_ACCELERATION_RAD_S2 = 3.0  # about x and y, below which a vehicle can only just be turned
 LEAST_YAW_ACCELERATION_RAD_S2 = 0.3
+RECOVERY_M = 2.0
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover
 
 
@@ -105,6 +106,14 @@ class Vehicle(Spec):
         torques = self._wrenches[1:]
         torque = np.where(torques > 0, torques * up, -torques * down).sum(axis=1)
         return torque / np.array(self.inertia_kg_m2)
+
+    @property
+    def recovery_s(self) -> float:
+        """Estimated time to turn upright from upside down, then to move RECOVERY_M and stop: its time scale."""
+        high = np.minimum(self.hover_thrusts_N + self.action_scale_N, [motor.max_N for motor in self.motors])
+        surplus = high.sum() / self.mass_kg - STANDARD_GRAVITY_M_S2
+        turn = 2.0 * (np.pi / self.angular_acceleration_rad_s2[:2].min()) ** 0.5
+        return float(turn + 2.0 * (RECOVERY_M / max(surplus, 0.05 * STANDARD_GRAVITY_M_S2)) ** 0.5)
 
     def warnings(self) -> list[str]:
         """What this vehicle can only just do, in one line each."""

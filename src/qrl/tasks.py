@@ -21,6 +21,7 @@ from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput
 
+PRESET_RECOVERY_S = 0.6  # and the time scale of their vehicle, the paper's (Vehicle.recovery_s)
 PRESET_PERIOD_S = {"quadrotor": 0.01, "pendulum": 0.05}  # control periods that the presets are made for
 
 
@@ -149,12 +150,18 @@ def task_preset(record: TaskRecord, where: str, name: str | None = None) -> dict
 
 def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any]:
     """A preset made for the shipped task of its world, for another one: durations keep their seconds at another control
-    period, and scales follow the size and the speed of a circle.
+    period, APG flies longer with a slower vehicle, and scales follow the size and the speed of a circle.
     """
     rate = PRESET_PERIOD_S[task.world] / task.control_period_s
     steps = ("num_timesteps", "episode_length", "unroll_length", "apg_episode_length")
     values = values | {name: max(1, round(values[name] * rate)) for name in steps if values[name]}
     values["gamma"] = float(values["gamma"]) ** (1.0 / rate)
+    if isinstance(task, task_spec.QuadrotorTask):
+        slower = task.vehicle.recovery_s / PRESET_RECOVERY_S
+        # Flights of APG that are over before the vehicle has settled teach it nothing about precision.
+        longer = min(4, 2 ** max(0, round(np.log2(slower))))
+        flights = max(values["apg_num_envs"] // longer, 8)
+        values |= {"apg_episode_length": values["apg_episode_length"] * longer, "apg_num_envs": flights}
     reward = task.reward
     if isinstance(reward, task_spec.CircleReward) and values["observation_scale"]:
         length, speed = max(1.0, reward.radius_m), max(1.0, abs(reward.speed_m_s) / 2.0)

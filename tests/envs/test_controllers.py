@@ -98,7 +98,7 @@ def level(position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
 def test_in_hover_the_action_is_hover_thrust(kind: str) -> None:
     """To the last bit of the thrust; and 10 cm off it is not, or nothing here would mean anything."""
     still = quadrotor.thrust_N(quadrotor.physics(HOVER.vehicle), controller(kind, "hover")(level()))
-    np.testing.assert_array_equal(still, quadrotor.hover_thrust_N(quadrotor.physics(HOVER.vehicle)))
+    np.testing.assert_array_equal(still, quadrotor.physics(HOVER.vehicle).hover_thrust_N)
     assert np.abs(controller(kind, "hover")(level((0.0, 0.0, -0.1)))).max() > 0.01
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from qrl_envs import quadrotor, rotation, task
 from qrl_envs.quadrotor import Body, Physics, Pose, Twist
+from qrl_envs.vehicle import Motor, Vehicle
 
 Array = np.ndarray
 
@@ -23,14 +24,14 @@ UP = np.array([0.0, 0.0, 1.0])
 FRONT_LEFT, REAR_LEFT, REAR_RIGHT, FRONT_RIGHT = range(4)
 
 # Nothing equal, nothing symmetric: a swapped index or sign shows.
-CROOKED = task.Vehicle(
+CROOKED = Vehicle(
     mass_kg=0.7,
     inertia_kg_m2=(0.002, 0.003, 0.004),
     motors=(
-        task.Motor(position_m=(0.11, 0.07), spin=1, max_N=5.0),
-        task.Motor(position_m=(-0.09, 0.06), spin=-1, max_N=4.0),
-        task.Motor(position_m=(-0.13, -0.08), spin=1, max_N=3.5),
-        task.Motor(position_m=(0.05, -0.12), spin=-1, max_N=3.0),
+        Motor(position_m=(0.11, 0.07), spin=1, max_N=5.0),
+        Motor(position_m=(-0.09, 0.06), spin=-1, max_N=4.0),
+        Motor(position_m=(-0.13, -0.08), spin=1, max_N=3.5),
+        Motor(position_m=(0.05, -0.12), spin=-1, max_N=3.0),
     ),
     yaw_moment_m=0.016,
     action_scale_N=6.0,
@@ -44,7 +45,7 @@ def float64() -> Iterator[None]:
         yield
 
 
-def physics(vehicle: task.Vehicle) -> Physics:
+def physics(vehicle: Vehicle) -> Physics:
     """The vehicle's parameters in double precision, its gravity rounded to the float32 that the world flies with."""
     return jax.tree.map(lambda x: x.astype(jnp.float64), quadrotor.physics(vehicle))
 

@@ -4,6 +4,7 @@ import copy
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from qrl_envs import task
@@ -58,7 +59,8 @@ def test_the_shipped_vehicle_is_fields(path: Path) -> None:
             assert abs(x) == abs(y)
             assert motor["spin"] == (1 if x * y > 0 else -1)  # diagonal pairs turn alike
         assert spec["control_period_s"] == 0.01
-        assert spec["evaluation"]["start"] == {"position_m": 2.0, "velocity_m_s": 1.0, "body_rate_rad_s": 1.0}
+        start = {"position_m": 2.0, "velocity_m_s": 1.0, "body_rate_rad_s": 1.0, "tilt_rad": np.pi}
+        assert spec["evaluation"]["start"] == start
         assert spec["bounds"] == {"distance_m": 20.0, "body_rate_rad_s": 100.0}
 
 
@@ -94,9 +96,11 @@ def test_a_reward_of_another_form_replaces_the_old_one(path: Path) -> None:
         load(path, circle('"reward": {"form": "hover", "w1_attitude": 1}'))
 
 
-def test_counts_may_be_written_with_an_exponent(path: Path) -> None:
-    """2e2 is 200."""
-    assert load(path, hover('"episode_steps": 2e2')).episode_steps == 200
+def test_durations_of_the_first_version_are_read(path: Path) -> None:
+    """It counted them in steps of the control period."""
+    mine = load(path, hover('"control_period_s": 0.005, "episode_steps": 300, "evaluation": {"return_steps": 2e2}'))
+    assert isinstance(mine, task.QuadrotorTask)
+    assert (mine.episode_s, mine.episode_steps, mine.evaluation.return_s) == (1.5, 300, 1.0)
 
 
 def test_a_flat_plate_is_a_body(path: Path) -> None:
@@ -133,7 +137,7 @@ MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
         hover(f'"vehicle": {{"motors": {motors(spin="2")}}}'),
         ["'vehicle.motors.0.spin'", "1 or -1", "found 2"],
     ),
-    "unknown key": (hover('"epsiode_steps": 3'), ["unknown key", "'epsiode_steps'", "did you mean 'episode_steps'"]),
+    "unknown key": (hover('"epsiode_s": 3'), ["unknown key", "'epsiode_s'", "did you mean 'episode_s'"]),
     "unknown key, deep": (hover('"vehicle": {"mass": 3}'), ["unknown key", "'vehicle.mass'", "'mass_kg'"]),
     "unknown key, in a list": (
         hover('"vehicle": {"motors": %s}' % motors().replace("max_N", "maxN")),  # noqa: UP031
@@ -150,12 +154,11 @@ MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
     "number for text": (hover('"description": 3'), ["'description'", "string", "found 3"]),
     "list for an object": (hover('"vehicle": []'), ["'vehicle'", "object", "[]"]),
     "object for a list": (hover('"vehicle": {"motors": {}}'), ["'vehicle.motors'", "{}"]),
-    "half a step": (hover('"episode_steps": 2.5'), ["'episode_steps'", "integer", "2.5"]),
-    "no step": (hover('"episode_steps": 0'), ["'episode_steps'", "1", "found 0"]),
+    "no step": (hover('"episode_s": 0'), ["'episode_s'", "greater than 0", "found 0"]),
     "negative range": (hover('"start": {"velocity_m_s": -1}'), ["'start.velocity_m_s'", "0", "-1"]),
     "negative weight": (hover('"reward": {"w3_action": -0.1}'), ["'reward.w3_action'", "0", "-0.1"]),
     "missing key": ('{"world": "pendulum"}', ["missing"]),
-    "key twice": (hover('"episode_steps": 3, "episode_steps": 4'), ["'episode_steps'", "twice"]),
+    "key twice": (hover('"episode_s": 3, "episode_s": 4'), ["'episode_s'", "twice"]),
     "key twice, deep": (hover('"vehicle": {"mass_kg": 3, "mass_kg": 4}'), ["'mass_kg'", "twice"]),
     "NaN": (hover('"control_period_s": NaN'), ["'control_period_s'", "NaN"]),
     "infinity": (hover('"control_period_s": -Infinity'), ["'control_period_s'", "-Infinity"]),
@@ -200,7 +203,7 @@ MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
         ["position_m", "1e+39"],
     ),
     "constant beyond single precision": (hover('"reward": {"constant": -1e39}'), ["'reward.constant'", "-1e+39"]),
-    "endless episode": (hover('"episode_steps": 1e300'), ["episode_steps"]),
+    "endless episode": (hover('"episode_s": 1e300'), ["episode_s"]),
     "period longer than the flight": (hover('"control_period_s": 20'), ["control_period_s"]),
 }
 

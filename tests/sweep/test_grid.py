@@ -131,7 +131,7 @@ def test_named_settings_set_several_at_once(tmp_path: Path) -> None:
         ("observation_scale", [None, [1.0] * 18], 2),
         ("xi", [0.1, 0.2], 1),
         ("xi", [None, 0.2], 2),
-        ("task.episode_steps", [100, 200], 2),
+        ("task.episode_s", [1.0, 2.0], 2),
         ("form", ["ratio", "difference"], 2),
         ("batch_size", [8, 16], 2),
     ],
@@ -214,8 +214,8 @@ WRONG: dict[str, tuple[dict, str]] = {
         r"evaluated alike, found another control period of its flights at task.control_period_s 0.05 and at",
     ),
     "returns of other lengths": (
-        {"axes": {"task.episode_steps": [200, 100]}},
-        r"evaluated alike, found another number of steps of its return at task.episode_steps 200 and at",
+        {"axes": {"task.episode_s": [2.0, 1.0]}},
+        r"evaluated alike, found another duration of its return at task.episode_s 2.0 and at",
     ),
     "flights of other lengths": (
         {"task": "inverted_pendulum", "axes": {"episode_length": [200, 100]}},
