@@ -12,7 +12,8 @@ from qrl_envs.task import CircleReward, HoverReward, PendulumReward
 
 def _norm(x: chex.Array) -> chex.Array:
     """Euclidean norm [], with gradient 0 at 0, where that of jnp.linalg.norm is not a number."""
-    return jnp.sqrt(jnp.maximum(jnp.sum(x * x), 1e-30))
+    square = jnp.sum(x * x)
+    return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
 class Hover(NamedTuple):

@@ -37,7 +37,8 @@ class Vehicle(Spec):
     @model_validator(mode="after")
     def _can_fly(self) -> "Vehicle":
         x, y, z = self.inertia_kg_m2
-        if 2 * max(x, y, z) > (x + y + z) * (1 + INERTIA_TOLERANCE):  # equality: a flat plate
+        greatest = max(x, y, z)
+        if greatest > (x + y + z - greatest) * (1 + INERTIA_TOLERANCE):  # equal: a flat plate
             raise ValueError(
                 f"expected inertia_kg_m2 of a rigid body: no moment above the sum of the other two, found {x}, {y}, {z}"
             )

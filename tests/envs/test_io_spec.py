@@ -19,7 +19,7 @@ def test_observations_of_a_quadrotor(name: str) -> None:
     assert found[1].frame.endswith("world x part of the body y axis")  # row-major, body -> world
     assert found[3].frame.endswith("world y part of the body x axis")
     assert all(port.frame.startswith("world: ") for port in found[9:15])
-    assert all(("hover point" if name == "hover" else "circle's centre") in port.frame for port in found[9:12])
+    assert all(("hover point" if name == "hover" else "circle's center") in port.frame for port in found[9:12])
 
 
 def test_actions_of_the_quadrotor() -> None:

@@ -1,8 +1,6 @@
 """The rewards of hover and circle against the paper's formulas (Sec. 5) written out in NumPy, in float64."""
 
-import json
 from collections.abc import Callable, Iterator
-from importlib import resources
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +9,7 @@ import pytest
 from brax.envs.base import State
 from scipy.spatial.transform import Rotation
 
-from qrl_envs import env, rewards
+from qrl_envs import env, rewards, task
 from qrl_envs.quadrotor import Body, Pose, Twist
 
 Array = np.ndarray
@@ -28,7 +26,7 @@ def float64() -> Iterator[None]:
 
 def weights(name: str, section: str) -> dict:
     """The reward of a shipped task file as JSON has it: what training adds up, or what `evaluation` does."""
-    spec = json.loads(resources.files("qrl_envs").joinpath("tasks", f"{name}.json").read_text(encoding="utf-8"))
+    spec = task.load(name).model_dump(mode="json")
     return spec[section]["reward"] if section == "evaluation" else spec["reward"]
 
 

@@ -97,8 +97,11 @@ def test_a_lopsided_vehicle_has_no_symmetry_that_moves_its_odd_motor(broken: dic
 
 def test_two_motors_in_one_place_leave_the_task_as_it_is() -> None:
     """The permutation is not unique: only the identity is drawn, and no action counts twice."""
-    motors = [motor.model_dump(mode="json") for motor in tasks.load("hover").vehicle.motors]  # pyright: ignore[reportAttributeAccessIssue]
-    env = changed("hover", {"motors": [motors[0], motors[0], *motors[2:]]})
+    env = worlds.make("hover")
+    same = [0, 0, 2, 3]
+    physics = env.params.physics
+    twice = physics._replace(motor_position_m=physics.motor_position_m[same,], motor_spin=physics.motor_spin[same,])
+    env = env.with_params(env.params._replace(physics=twice))
     found = draws(env, 8)
     np.testing.assert_array_equal(found.action, np.broadcast_to(np.eye(4), found.action.shape))
     np.testing.assert_array_equal(found.observation, np.broadcast_to(np.eye(18), found.observation.shape))

@@ -15,7 +15,11 @@ MOTOR = '{"position_m": [0.1, 0.1], "spin": %s, "max_N": %s}'
 
 
 def motors(spin: str = "1", max_N: str = "8.0") -> str:
-    return "[" + ", ".join([MOTOR % (spin, max_N)] * 4) + "]"
+    """Four motors in a square, the spin given for the first."""
+    at = ["[0.1, 0.1]", "[-0.1, 0.1]", "[-0.1, -0.1]", "[0.1, -0.1]"]
+    spins = [spin, "-1", "1", "-1"]
+    each = [(MOTOR % (s, max_N)).replace(at[0], p) for s, p in zip(spins, at, strict=True)]
+    return "[" + ", ".join(each) + "]"
 
 
 def hover(keys: str) -> str:
@@ -250,3 +254,110 @@ def test_a_folder_is_not_a_task(tmp_path: Path) -> None:
     folder.mkdir()
     with pytest.raises(BadInput, match=r"folder\.json: cannot be read"):
         task.load(str(folder))
+
+
+def vehicle(changes: dict) -> str:
+    """A file of hover with the paper's vehicle, changed."""
+    return hover(f'"vehicle": {json.dumps(changes)}')
+
+
+def four(*positions: tuple[float, float], spins: tuple[int, ...] = (1, -1, 1, -1)) -> list[dict]:
+    return [{"position_m": p, "spin": s, "max_N": 8.0} for p, s in zip(positions, spins, strict=True)]
+
+
+CANNOT_FLY = {
+    "center of mass outside": (
+        {"motors": four((-0.02, 0.1), (-0.3, 0.1), (-0.3, -0.1), (-0.02, -0.1))},
+        "around the center of mass",
+    ),
+    "more than a motor has": (
+        {"motors": four((0.01, 0.1), (-0.3, 0.1), (-0.3, -0.1), (0.01, -0.1)), "mass_kg": 2.0},
+        "motor 1 would need",
+    ),
+    "no arms": ({"motors": four(*[(0.0, 0.0)] * 4)}, "turn the vehicle about body x"),
+    "millimeters": (
+        {"motors": four((74.0, 74.0), (-74.0, 74.0), (-74.0, -74.0), (74.0, -74.0))},
+        "position_m in meters",
+    ),
+    "a fraction for newtons": ({"action_scale_N": 0.002}, "action_scale_N in newtons"),
+}
+
+
+@pytest.mark.parametrize(("changes", "words"), CANNOT_FLY.values(), ids=CANNOT_FLY.keys())
+def test_a_vehicle_that_cannot_fly_is_refused_with_the_reason(changes: dict, words: str, path: Path) -> None:
+    with pytest.raises(BadInput, match=words):
+        load(path, vehicle(changes))
+
+
+def test_what_can_only_just_fly_is_warned_about(path: Path) -> None:
+    """Little thrust to spare; yaw that comes with roll only; hardly any yaw. The paper's vehicle gets no warning."""
+    for changes, words in (
+        ({"mass_kg": 2.7}, "can only just hover"),
+        (
+            {"motors": four((0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1), spins=(1, 1, -1, -1))},
+            "all axes independently",
+        ),
+        ({"yaw_moment_m": 1e-9}, "hardly turn about body z"),
+    ):
+        (warning,) = load(path, vehicle(changes)).warnings()
+        assert words in warning
+    assert task.load("hover").warnings() == []
+
+
+def test_hover_thrusts_balance_an_off_center_mass() -> None:
+    """Forces and moments by statics; mg/4 each on the paper's vehicle."""
+    hover = task.load("hover")
+    assert isinstance(hover, task.QuadrotorTask)
+    np.testing.assert_allclose(hover.vehicle.hover_thrusts_N, 0.667 * 9.81 / 4, rtol=1e-12)
+
+
+def test_a_rounded_inertia_is_taken(path: Path) -> None:
+    """Up to 5 % over a rigid body's bound, no more."""
+    load(path, vehicle({"inertia_kg_m2": [0.001, 0.001, 0.00205]}))
+    with pytest.raises(BadInput, match="rigid body"):
+        load(path, vehicle({"inertia_kg_m2": [0.001, 0.001, 0.0022]}))
+
+
+def test_a_task_names_its_vehicle_and_another_may_fly_it(path: Path) -> None:
+    """By a shipped name, or a file beside the task's; the argument replaces the task's own."""
+    crazyflie = task.load("circle", "crazyflie")
+    assert isinstance(crazyflie, task.QuadrotorTask)
+    assert crazyflie.vehicle.mass_kg == 0.028
+    (path.parent / "light.json").write_text(json.dumps({**SHIPPED["hover"]["vehicle"], "mass_kg": 0.5}))
+    mine = load(path, hover('"vehicle": "light.json"'))
+    assert isinstance(mine, task.QuadrotorTask)
+    assert mine.vehicle.mass_kg == 0.5
+    with pytest.raises(BadInput, match="did you mean 'crazyflie'"):
+        task.load("hover", "crazyfly")
+    with pytest.raises(BadInput, match="has no vehicle"):
+        task.load("pendulum", "crazyflie")
+
+
+def test_a_vehicles_action_scale_reaches_its_farther_limit(path: Path) -> None:
+    """Where the file gives none."""
+    spec = {key: value for key, value in SHIPPED["hover"]["vehicle"].items() if key != "action_scale_N"}
+    (path.parent / "plain.json").write_text(json.dumps(spec))
+    mine = load(path, hover('"vehicle": "plain.json"'))
+    assert isinstance(mine, task.QuadrotorTask)
+    assert mine.vehicle.action_scale_N == pytest.approx(8.0 - 0.667 * 9.81 / 4)
+
+
+def circle_of(radius: float, speed: float, **keys: object) -> str:
+    ring = {"radius_m": radius, "speed_m_s": speed}
+    return json.dumps({"extend": "circle", "reward": ring, "evaluation": {"reward": ring}, **keys})
+
+
+def test_circles_of_any_size_and_sense(path: Path) -> None:
+    """A speed error costs the same on every circle; what no thrust can hold is refused."""
+    for radius, speed in ((5.0, 3.0), (1.0, -2.0)):
+        mine = load(path, circle_of(radius, speed))
+        assert isinstance(mine.reward, task.CircleReward)
+        assert mine.reward.w5_direction_s_m2 == 0.5 / radius
+    for radius, speed, words in ((0.2, 6.0, "180 m/s²"), (1.0, 0.0, "clockwise"), (30.0, 3.0, "bounds.distance_m")):
+        with pytest.raises(BadInput, match=words):
+            load(path, circle_of(radius, speed))
+
+
+def test_bounds_within_the_starts_are_refused(path: Path) -> None:
+    with pytest.raises(BadInput, match=r"bounds\.distance_m beyond the starts"):
+        load(path, hover('"bounds": {"distance_m": 1.5}'))
