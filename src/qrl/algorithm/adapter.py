@@ -58,8 +58,7 @@ def adapt(env: Env) -> TaskEnv:
     found = [name for name in halves if hasattr(env, name)]
     if len(found) == 1:
         missing = next(name for name in halves if name not in found)
-        raise ValueError(
-            f"{type(env).__name__}: expected both 'params' and 'with_params(params)', or neither; '{missing}' is missing"
-        )
+        expected = "expected both 'params' and 'with_params(params)', or neither"
+        raise ValueError(f"{type(env).__name__}: {expected}; '{missing}' is missing")
     task_env: Any = env if all(hasattr(env, name) for name in _ABILITIES) else _Adapted(env)
     return task_env
