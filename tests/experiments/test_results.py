@@ -62,6 +62,7 @@ def test_the_commit_is_that_of_the_run(
     commits = iter(["aaa", "bbb+"])
 
     def train(run: RunSpec, out: Path, **_: bool) -> float:
+        out.mkdir(parents=True)
         stored = run.config().model_copy(update={"versions": {"commit": next(commits)}, "devices": ["TFRT_CPU_0"]})
         files.write_json(out / "config.json", stored.model_dump(mode="json"))
         files.write_json(out / "evaluation.json", EVALUATION | {"starts": 1000})
