@@ -1,4 +1,4 @@
-"""The ratios as one plot: how many times qrl's time another takes, or how many times its rate qrl reaches."""
+"""The ratios as one plot: each contestant's time over qrl's, and qrl's rate over each contestant's."""
 
 import math
 import textwrap
@@ -38,7 +38,7 @@ def bars(runs: list[Run]) -> list[Bar]:
                 spent = {r["seed"]: r["lines"][-1][clock] for r in mine if r["contestant"] == who and r["lines"]}
                 ratio = ratios(theirs, ours)
                 bound = ratio is not None and not math.isfinite(ratio.median)
-                if ratio and not math.isfinite(ratio.greatest):
+                if ratio and not math.isfinite(ratio.max):
                     ratio = ratios(
                         {s: v if math.isfinite(v) else spent.get(s, math.nan) for s, v in theirs.items()}, ours
                     )
@@ -54,13 +54,13 @@ def bars(runs: list[Run]) -> list[Bar]:
 
 
 def plot(path: Path, runs: list[Run]) -> None:
-    """Horizontal bars on a logarithmic axis, whiskers from least to greatest; nothing where there is no ratio."""
+    """Horizontal bars on a logarithmic axis, whiskers from min to max; no file where there is no ratio."""
     found = bars(runs)
     if not found:
         return
     figure, axes = plt.subplots(figsize=(9.0, 1.4 + 0.3 * len(found)), layout="constrained")
     for y, bar in enumerate(found):
-        low, high = bar.ratio.median - bar.ratio.least, bar.ratio.greatest - bar.ratio.median
+        low, high = bar.ratio.median - bar.ratio.min, bar.ratio.max - bar.ratio.median
         axes.barh(
             y,
             bar.ratio.median - 1.0,
@@ -74,9 +74,7 @@ def plot(path: Path, runs: list[Run]) -> None:
             capsize=2,
         )
         text = f"{'> ' if bar.bound else ''}{number(bar.ratio.median)}×"
-        axes.annotate(
-            text, (max(bar.ratio.greatest, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8
-        )
+        axes.annotate(text, (max(bar.ratio.max, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8)
     axes.set_xscale("log")
     axes.axvline(1.0, color="#333333", linewidth=1.0)
     axes.set_yticks(range(len(found)), [textwrap.fill(bar.label, 48) for bar in found], fontsize=8)

@@ -1,4 +1,4 @@
-"""The paper's six figures, for one column of a page; of matplotlib's objects alone, without pyplot."""
+"""The paper's six figures, of one column's width; matplotlib objects, without pyplot."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,12 +15,13 @@ from matplotlib.ticker import FuncFormatter
 
 from experiments.figures.flights import PolicyFlights
 from experiments.output import atomic_write
-from qrl_envs.plots.frame import COLOURS, INK
+from qrl_envs.plots.frame import COLOURS as COLORS
+from qrl_envs.plots.frame import INK
 from qrl_envs.task import CircleReward
 
 WIDTH_IN = 3.4  # a column
 PIXELS_PER_INCH = 200
-POINTS = 8.0  # the least size of a letter
+POINTS = 8.0  # font size
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # lines differ in dash as well as color
 PUBLISHED = ((2e6, 151.0), (3e6, 158.0), (5e6, 160.6), (10e6, 162.9))  # authors' checkpoints, flown: steps, return
 SHOWN = 5
@@ -53,7 +54,7 @@ class Curves(NamedTuple):
     label: str
     steps: np.ndarray  # [x]
     returns: np.ndarray  # [seeds, x]
-    success: np.ndarray  # [seeds, x], a share; NaN where it is not measured
+    success: np.ndarray  # [seeds, x], a fraction; NaN where it is not measured
 
     @property
     def seeds(self) -> int:
@@ -110,7 +111,7 @@ def pendulum(rates: list[Rate]) -> Figure:
     with style():
         figure, panels = _figure(0.4 + 2.2 * len(groups), len(groups), sharex=True, sharey=True)
         for axes, (title, pair) in zip(panels, groups.items(), strict=True):
-            colors = iter(COLOURS)
+            colors = iter(COLORS)
             for rate in pair:
                 for curves, dash in ((rate.ours, DASHES[0]), (rate.ppo, DASHES[1])):
                     _draw(axes, curves.steps, curves.returns, next(colors), dash, curves.label)
@@ -124,10 +125,8 @@ def hover(curves: Curves) -> Figure:
     """Return, with the published checkpoints' for reference, and success."""
     with style():
         figure, (upper, lower) = _figure(3.4, 2, sharex=True, height_ratios=(1.5, 1.0))
-        _draw(upper, curves.steps, curves.returns, COLOURS[0], DASHES[0], curves.label)
-        upper.plot(
-            *zip(*PUBLISHED, strict=True), "s--", color=COLOURS[1], markersize=3.5, label="published checkpoints"
-        )
+        _draw(upper, curves.steps, curves.returns, COLORS[0], DASHES[0], curves.label)
+        upper.plot(*zip(*PUBLISHED, strict=True), "s--", color=COLORS[1], markersize=3.5, label="published checkpoints")
         upper.set(ylabel="return of 200 steps [1]", ylim=(min(_floor(curves.returns), 90.0), 170.0))
         upper.legend(loc="lower right")
         _share(lower, curves)
@@ -140,7 +139,7 @@ def circle(curves: Curves) -> Figure:
     """Return and success."""
     with style():
         figure, (upper, lower) = _figure(3.2, 2, sharex=True, height_ratios=(1.4, 1.0))
-        _draw(upper, curves.steps, curves.returns, COLOURS[0], DASHES[0], curves.label)
+        _draw(upper, curves.steps, curves.returns, COLORS[0], DASHES[0], curves.label)
         upper.set(ylabel="return of 200 steps [1]")
         upper.legend(loc="lower right")
         _share(lower, curves)
@@ -156,7 +155,7 @@ def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, dash: A
 
 
 def _share(axes: Axes, curves: Curves) -> None:
-    _draw(axes, curves.steps, 100.0 * curves.success, COLOURS[2], DASHES[0], "")
+    _draw(axes, curves.steps, 100.0 * curves.success, COLORS[2], DASHES[0], "")
     axes.set(ylabel="success [%]", ylim=(-4.0, 104.0))
 
 
@@ -189,9 +188,9 @@ def trial(flown: PolicyFlights) -> Figure:
         for i, (name, dash) in enumerate(zip("xyz", DASHES, strict=True)):
             first, *others = flown.observations[:SHOWN, :, 9 + i]
             for other in others:
-                axes.plot(flown.times_s, other, color=COLOURS[i], linewidth=0.7, alpha=0.35)
-            axes.plot(flown.times_s, first, color=COLOURS[i], linestyle=dash, label=name, zorder=3)
-        # All of the thick lines, beneath the legend; a diverging flight leaves the window.
+                axes.plot(flown.times_s, other, color=COLORS[i], linewidth=0.7, alpha=0.35)
+            axes.plot(flown.times_s, first, color=COLORS[i], linestyle=dash, label=name, zorder=3)
+        # The window has all of the thick lines, below the legend; a diverging flight leaves it.
         drawn = flown.observations[0, :, 9:12]
         low, high = np.nanmin(drawn), np.nanmax(drawn)
         limits = low - 0.2 * (high - low), high + 0.3 * (high - low)
@@ -204,9 +203,9 @@ def from_above(flown: PolicyFlights) -> Figure:
     """Paths of the first five flights on the x-y plane, and the reference circle."""
     with style():
         figure, (axes,) = _figure(3.5)
-        angle, r = np.linspace(0.0, 2.0 * np.pi, 181), _wanted(flown).radius_m
+        angle, r = np.linspace(0.0, 2.0 * np.pi, 181), _target(flown).radius_m
         x, y = r * np.cos(angle), r * np.sin(angle)
-        for color, path in zip(COLOURS, flown.observations[:SHOWN, :, 9:11], strict=False):
+        for color, path in zip(COLORS, flown.observations[:SHOWN, :, 9:11], strict=False):
             axes.plot(*path.T, color=color, linewidth=1.0)
             axes.plot(*path[0], "o", color=color, markeredgecolor="white", markersize=6, zorder=4)
         axes.plot([], [], "o", color=INK, markersize=5, label="start")
@@ -222,18 +221,18 @@ def velocity(flown: PolicyFlights) -> Figure:
     """vx and vy of the first flight over time, and ± the reference speed."""
     with style():
         figure, (axes,) = _figure(2.3)
-        wanted = _wanted(flown).speed_m_s
+        reference = _target(flown).speed_m_s
         for i, (name, dash) in enumerate(zip(("vx", "vy"), DASHES, strict=False)):
             values = flown.observations[0, :, 12 + i]
-            axes.plot(flown.times_s, values, color=COLOURS[i], linestyle=dash, label=name)
-        for k, level in enumerate((wanted, -wanted)):
-            axes.axhline(level, color="black", linestyle=":", linewidth=1.0, label="" if k else f"±{wanted:g} m/s")
+            axes.plot(flown.times_s, values, color=COLORS[i], linestyle=dash, label=name)
+        for k, level in enumerate((reference, -reference)):
+            axes.axhline(level, color="black", linestyle=":", linewidth=1.0, label="" if k else f"±{reference:g} m/s")
         axes.set(xlabel="time [s]", ylabel="velocity [m/s]", xlim=(0.0, flown.times_s[-1]))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return figure
 
 
-def _wanted(flown: PolicyFlights) -> CircleReward:
-    wanted = flown.task.evaluation.reward
-    assert isinstance(wanted, CircleReward)
-    return wanted
+def _target(flown: PolicyFlights) -> CircleReward:
+    reward = flown.task.evaluation.reward
+    assert isinstance(reward, CircleReward)
+    return reward

@@ -3,8 +3,8 @@
     .venv/bin/python -m experiments.gallery.make [--out docs] [--runs experiments/out] [--fast] [--fresh]
 
 The paper's figures (as `make figures` makes them), the policies of the presets that ship (trained, flown by `qrl
-evaluate` beside controllers and PPO, and shown by `qrl view`), and the pages of
-`make ablation` and `make bench` where they exist. Runs of the same code are kept. The viewer's picture needs Chromium
+evaluate` beside controllers and PPO, and shown by `qrl view`), and the pages of `make ablation` and `make bench` where
+they exist. Runs of the same code are kept. The viewer's picture needs Chromium
 and its driver; without them the old one stays.
 """
 
@@ -115,7 +115,7 @@ def screenshot(html: Path, address: str, target: Path) -> None:
         if not wrong:
             atomic_write(target, lambda temporary: temporary.write_bytes(picture))
     if wrong:
-        print(f"gallery: {target} stays as it is: {wrong}", file=sys.stderr)
+        print(f"gallery: {target} kept: {wrong}", file=sys.stderr)
 
 
 def read_if_exists(path: Path) -> str:
