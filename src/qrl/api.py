@@ -184,7 +184,7 @@ def _valid(name: str, kind: Any, value: Any) -> Any:
     except ValidationError as error:
         problem = error.errors()[0]
         if problem["type"] == "value_error":  # of our own validators, whose messages are complete
-            raise BadInput(f"qrl.train: {name}: {problem['ctx']['error']}") from None
+            raise BadInput(f"qrl.train: {name}: {problem.get('ctx', {})['error']}") from None
         expected = problem["msg"].replace("Input should be", "expected")
         raise BadInput(f"qrl.train: {name}: {expected[0].lower()}{expected[1:]}, found {value!r:.60}") from None
 
