@@ -157,10 +157,15 @@ def run_contestant(contestant: Contestant, python: Path, seed: int, budget_secon
     out, err, outcome = run_with_timeout(script, env, budget_seconds + GRACE_SECONDS)
     lines = [json.loads(line.removeprefix(MARK)) for line in out.splitlines() if line.startswith(MARK)]
     error = (err.strip().splitlines() or [""])[-1][:300] if outcome.startswith("exit") else ""
-    who = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
-    how = {"command": command(contestant), "budget_seconds": budget_seconds, "commit": records.commit(), "load": load}
-    how["fingerprint"] = run_fingerprint(contestant)
-    return {**who, **how, "outcome": outcome, "error": error, "lines": lines}
+    identity = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
+    origin = {
+        "command": command(contestant),
+        "budget_seconds": budget_seconds,
+        "commit": records.commit(),
+        "load": load,
+    }
+    origin["fingerprint"] = run_fingerprint(contestant)
+    return {**identity, **origin, "outcome": outcome, "error": error, "lines": lines}
 
 
 def run_with_timeout(words: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:

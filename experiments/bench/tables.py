@@ -56,12 +56,12 @@ def to_solve(run: Run, clock: str, bar: float | None = None) -> float:
     return math.inf if line is None else float(line.get(clock, math.nan))
 
 
-def ratios(theirs: dict[int, float], ours: dict[int, float]) -> Spread | None:
+def ratios(other: dict[int, float], ours: dict[int, float]) -> Spread | None:
     """Of values by seed, each over ours of the same round (run one after the other); None: no round has both.
 
     Where ours is infinite the ratio says nothing, and that round is left out.
     """
-    both = [theirs[seed] / ours[seed] for seed in theirs if seed in ours and 0 < ours[seed] < math.inf]
+    both = [other[seed] / ours[seed] for seed in other if seed in ours and 0 < ours[seed] < math.inf]
     return spread(both) if both else None
 
 
@@ -98,13 +98,21 @@ def race(runs: list[Run], group: str) -> str:
     head = ["", "solved", "steps", "training [s]", "compiling [s]", "total [s]", "training / qrl", "total / qrl"]
     head += ["training [s] to −160"] * len(easier)
     rows = []
-    for who in _names(runs):
-        mine = [run for run in runs if run["contestant"] == who]
-        solved = sum(first_at(run, name, bar) is not None for run in mine)
-        row = [who, f"{solved} of {len(mine)}", *(cell(spread(by_seed(runs, who, c).values())) for c in CLOCKS)]
+    for contestant in _names(runs):
+        selected = [run for run in runs if run["contestant"] == contestant]
+        solved = sum(first_at(run, name, bar) is not None for run in selected)
+        row = [
+            contestant,
+            f"{solved} of {len(selected)}",
+            *(cell(spread(by_seed(runs, contestant, c).values())) for c in CLOCKS),
+        ]
         for clock in ("train_seconds", "total_seconds"):
-            row.append("" if who == QRL else cell(ratios(by_seed(runs, who, clock), by_seed(runs, QRL, clock)), "×"))
-        row += [cell(spread(by_seed(runs, who, "train_seconds", b).values())) for b in easier]
+            row.append(
+                ""
+                if contestant == QRL
+                else cell(ratios(by_seed(runs, contestant, clock), by_seed(runs, QRL, clock)), "×")
+            )
+        row += [cell(spread(by_seed(runs, contestant, "train_seconds", b).values())) for b in easier]
         rows.append(row)
     return table(head, rows)
 
@@ -112,7 +120,7 @@ def race(runs: list[Run], group: str) -> str:
 def commands(runs: list[Run]) -> str:
     """The table of complete commands: a row for each measure of their last line."""
     names = list(dict.fromkeys(name for run in runs for name in _last(run)))
-    each = {who: [_last(run) for run in runs if run["contestant"] == who] for who in _names(runs)}
+    each = {contestant: [_last(run) for run in runs if run["contestant"] == contestant] for contestant in _names(runs)}
     rows = [[name.replace("_", " "), *(_of(lines, name) for lines in each.values())] for name in names]
     return table(["", *each], rows)
 
@@ -132,11 +140,11 @@ def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
     """
     found: dict[str, dict[str, dict[int, float]]] = {}
     for run in runs:
-        who, *how = run["contestant"].split(", ")
+        contestant, *how = run["contestant"].split(", ")
         for line in run["lines"]:
             value = line.get("per_second", line.get("seconds"))
             figure = ", ".join([line["figure"], *how])
-            found.setdefault(figure, {}).setdefault(who, {})[run["seed"]] = float(value)
+            found.setdefault(figure, {}).setdefault(contestant, {})[run["seed"]] = float(value)
     return found
 
 
@@ -145,9 +153,9 @@ def speed(runs: list[Run]) -> str:
     found, rows = figures(runs), []
     for figure, values in found.items():
         ours = found.get(strip_device_suffix(figure), {}).get(QRL, {})
-        for who, theirs in values.items():
-            ratio = None if who == QRL else ratios(ours, theirs)
-            rows.append([figure, who, cell(spread(theirs.values())), cell(ratio, "×") if ratio else ""])
+        for contestant, other in values.items():
+            ratio = None if contestant == QRL else ratios(ours, other)
+            rows.append([figure, contestant, cell(spread(other.values())), cell(ratio, "×") if ratio else ""])
     return table(["", "", "a second, or seconds", "qrl / this"], rows)
 
 
@@ -160,25 +168,25 @@ def derived(runs: list[Run]) -> str:
     """Ratios within a contestant: a given number of devices over its default, and the cost of acting by lanes."""
     found, rows = figures(runs), []
     for figure, values in found.items():
-        for who, given in values.items():
-            by_itself = found.get(strip_device_suffix(figure), {}).get(who, {})
+        for contestant, given in values.items():
+            by_itself = found.get(strip_device_suffix(figure), {}).get(contestant, {})
             if figure.endswith(TWO_DEVICES):
-                rows.append([f"{figure}, over its default", who, cell(ratios(given, by_itself), "×")])
+                rows.append([f"{figure}, over its default", contestant, cell(ratios(given, by_itself), "×")])
             elif figure.endswith(ONE_DEVICE):
                 rows.append(
                     [
                         f"{strip_device_suffix(figure)}, its default over one device",
-                        who,
+                        contestant,
                         cell(ratios(by_itself, given), "×"),
                     ]
                 )
     acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
-    for who in dict.fromkeys(who for values in acting for who in values):
-        each = [values[who] for values in acting if who in values]
+    for contestant in dict.fromkeys(contestant for values in acting for contestant in values):
+        each = [values[contestant] for values in acting if contestant in values]
         seeds = set.intersection(*(set(rates) for rates in each))
         high, low = ({s: f(rates[s] for rates in each) for s in sorted(seeds)} for f in (max, min))
         label = f"acting, a step's highest cost over its lowest, of {len(each)} numbers of lanes"
-        rows.append([label, who, cell(ratios(high, low), "×")])
+        rows.append([label, contestant, cell(ratios(high, low), "×")])
     return table(["", "", "ratio"], rows) if rows else ""
 
 
@@ -195,11 +203,17 @@ def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> st
     )
     parts.append(TUNED)
     for group, title in GROUPS.items():
-        mine = [run for run in runs if run["group"] == group]
-        if mine:
-            made = race(mine, group) if group in BARS else commands(mine) if group == "commands" else speed(mine)
+        selected = [run for run in runs if run["group"] == group]
+        if selected:
+            made = (
+                race(selected, group)
+                if group in BARS
+                else commands(selected)
+                if group == "commands"
+                else speed(selected)
+            )
             parts += [f"## {title}", made]
-            if group == "speed" and (more := derived(mine)):
+            if group == "speed" and (more := derived(selected)):
                 parts.append(more)
     broken = [run for run in runs if run["outcome"] not in ("done", "out of time")]
     if absent or broken:

@@ -92,10 +92,12 @@ def rows(out: Path) -> dict[str, Row]:
         lines = list(csv.DictReader(file))
     found = {}
     for name in dict.fromkeys(line["objective"] for line in lines):
-        mine = [line for line in lines if line["objective"] == name]
-        diverged = [bool(line["diverged"]) for line in mine]
-        returns = [-np.inf if bad else float(line["return_mean"]) for bad, line in zip(diverged, mine, strict=True)]
-        success = [0.0 if bad else float(line["success"] or "nan") for bad, line in zip(diverged, mine, strict=True)]
+        selected = [line for line in lines if line["objective"] == name]
+        diverged = [bool(line["diverged"]) for line in selected]
+        returns = [-np.inf if bad else float(line["return_mean"]) for bad, line in zip(diverged, selected, strict=True)]
+        success = [
+            0.0 if bad else float(line["success"] or "nan") for bad, line in zip(diverged, selected, strict=True)
+        ]
         found[name] = Row(np.array(returns), np.array(success), sum(diverged))
     return found
 

@@ -82,12 +82,12 @@ def evaluate_preset(task: str, folder: Path, *, fresh: bool) -> PresetResult:
     ours, ppo = RunSpec(task, task, task, {}), RunSpec(f"{task}-ppo", task, f"{task}_ppo", {})
     for one in (ours, ppo):
         ensure_run(one, folder / one.name, fresh=fresh)
-    mine = folder / ours.name
+    run = folder / ours.name
     off = ["--off-nominal"] if task != "pendulum" else []
-    figure_runs.qrl(["evaluate", str(mine), *off, "--beside", str(folder / ppo.name)])
+    figure_runs.qrl(["evaluate", str(run), *off, "--beside", str(folder / ppo.name)])
     if task == VIEWED:
-        figure_runs.qrl(["view", str(mine)])
-    return PresetResult(ours, ppo, mine, json.loads((mine / "evaluation.json").read_text(encoding="utf-8")))
+        figure_runs.qrl(["view", str(run)])
+    return PresetResult(ours, ppo, run, json.loads((run / "evaluation.json").read_text(encoding="utf-8")))
 
 
 def ensure_run(one: RunSpec, folder: Path, *, fresh: bool) -> None:
