@@ -10,7 +10,6 @@ Each seed is one `qrl train` and one `qrl evaluate` from 1,000 starts; a finishe
 
 import json
 import math
-import os
 import re
 import shutil
 import sys
@@ -26,13 +25,15 @@ from experiments.bench.run import machine
 from experiments.figures import runs
 from experiments.figures.runs import Failed, RunSpec
 from experiments.output import table
-from qrl.runs import files, record
+from qrl import tasks
+from qrl.runs import files
+from qrl.runs.record import RunConfig
 from qrl_envs.specfile import BadInput
 
 RESULTS, RUNS = Path("docs/results.json"), Path("experiments/out/results")
 SEEDS = (100,)
-PAPER = {"apg_fraction": 0.0, "num_timesteps": 4_500_000}
-ALONE, WITH_APG = "paper's method alone", "with APG"
+NO_APG = {"apg_fraction": 0.0, "num_timesteps": 4_500_000}
+WITHOUT_APG, WITH_APG = "without APG (the paper's learner, with symmetries)", "with APG"
 STEADY = (  # measure, label, factor, format, unit
     ("rms_position_m", "", 1e3, ".1f", " mm"),
     ("rms_radius_m", "radius ", 1e3, ".1f", " mm"),
@@ -54,11 +55,11 @@ class Row(NamedTuple):
 
 
 ROWS = (
-    Row("hover", ALONE, PAPER),
+    Row("hover", WITHOUT_APG, NO_APG),
     Row("hover", WITH_APG, {}),
-    Row("circle", ALONE, PAPER),
+    Row("circle", WITHOUT_APG, NO_APG),
     Row("circle", WITH_APG, {}),
-    Row("pendulum", ALONE, {}),  # its preset has no APG
+    Row("pendulum", WITHOUT_APG, {}),  # its preset has no APG
 )
 
 
@@ -90,22 +91,19 @@ def main(argv: list[str] | None = None) -> int:
 
 def measure(folder: Path, *, fresh: bool) -> dict[str, Any]:
     """Train what is not current, evaluate all, and return what docs/results.json holds."""
-    found: dict[str, Any] = {
-        "machine": machine(),
-        "devices": os.environ.get("JAX_NUM_CPU_DEVICES", "all cores"),
-        "versions": record.versions(),
-        "seeds": list(SEEDS),
-        "rows": [],
-        "baselines": {},
-    }
+    here = {name: value for name, value in machine().items() if name in ("CPU", "cores")}
+    found: dict[str, Any] = {"machine": here, "seeds": list(SEEDS), "rows": [], "baselines": {}}
     for row in ROWS:
-        evaluations, seconds = [], []
+        evaluations, seconds, configs = [], [], []
         for seed in SEEDS:
             out = folder / row.run(seed).name
             seconds.append(train(row.run(seed), out, fresh=fresh))
             runs.qrl(["evaluate", str(out)])
             evaluations.append(json.loads((out / "evaluation.json").read_text(encoding="utf-8")))
-        found["rows"].append(summary(row, evaluations, seconds))
+            configs.append(tasks.load_run_config(out))
+            if (commit := configs[-1].versions["commit"]).endswith("+"):
+                print(f"results: warning: {out}: trained by changed files of commit {commit}", file=sys.stderr)
+        found["rows"].append(summary(row, evaluations, seconds, configs))
         found["starts"] = evaluations[0]["starts"]
         if "baselines" in evaluations[0]:
             found["baselines"][row.task] = evaluations[0]["baselines"]
@@ -113,7 +111,7 @@ def measure(folder: Path, *, fresh: bool) -> dict[str, Any]:
 
 
 def train(run: RunSpec, out: Path, *, fresh: bool) -> float:
-    """Train unless the run is current; the wall seconds of the whole command, with an empty compile cache."""
+    """Train unless the run is current; the wall seconds of the command, with an empty compile cache."""
     seconds, cache = out / "command_seconds", out.with_name(f"{out.name}-cache")
     if fresh or not seconds.exists() or not runs.is_current(out, run.config()):
         shutil.rmtree(out, ignore_errors=True)
@@ -124,19 +122,28 @@ def train(run: RunSpec, out: Path, *, fresh: bool) -> float:
     return float(seconds.read_text())
 
 
-def summary(row: Row, evaluations: list[dict[str, Any]], seconds: list[float]) -> dict[str, Any]:
-    """A row of docs/results.json: each measure's median and worst over seeds."""
+def summary(
+    row: Row, evaluations: list[dict[str, Any]], seconds: list[float], configs: list[RunConfig]
+) -> dict[str, Any]:
+    """A row of docs/results.json: each measure's median and worst over seeds; versions and devices of the runs."""
     measures = [name for name in evaluations[0] if name.startswith(("return_", "success", "settle_", "rms_"))]
     return {
         "task": row.task,
         "method": row.method,
         "command": f"qrl {' '.join(row.run(SEEDS[0]).words)}",
         "preset": row.task,
-        "commit": record.commit(),
+        "versions": joined([config.versions for config in configs]),
+        "devices": " or ".join(sorted({", ".join(config.devices) for config in configs})),
         "steps": evaluations[0]["env_steps"],
         "command_seconds": spread("command_seconds", seconds),
         **{name: spread(name, [each[name] for each in evaluations]) for name in measures},
     }
+
+
+def joined(versions: list[dict[str, str]]) -> dict[str, str]:
+    """The version of each package, or all of them where runs differ."""
+    names = dict.fromkeys(name for each in versions for name in each)
+    return {name: " or ".join(sorted({each.get(name, "none") for each in versions})) for name in names}
 
 
 def spread(name: str, values: Sequence[float | None]) -> dict[str, float | None]:
@@ -172,7 +179,7 @@ def tables(path: Path = RESULTS) -> dict[str, str]:
 
 
 def worst(row: dict[str, Any]) -> dict[str, float | None]:
-    return {name: value["worst"] for name, value in row.items() if isinstance(value, dict)}
+    return {name: value["worst"] for name, value in row.items() if isinstance(value, dict) and "worst" in value}
 
 
 def cells(measures: dict[str, float | None]) -> list[str]:

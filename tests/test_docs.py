@@ -118,6 +118,32 @@ def test_results_are_of_the_presets_that_ship() -> None:
     assert results.main(["--check", str(ROOT / "README.md")]) == 0
 
 
+def test_the_readme_states_measured_times() -> None:
+    """The seconds of `qrl train` are those of docs/results.json, of the presets as they ship."""
+    found = json.loads((ROOT / "docs" / "results.json").read_text(encoding="utf-8"))
+    measured = {row["command"]: row["command_seconds"]["worst"] for row in found["rows"]}
+    text = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    stated = re.findall(r"`qrl train (\w+)` took (\d+) s|`qrl train (\w+)` (\d+) s", text)
+    times = {a or b: int(s or t) for a, s, b, t in stated}
+    assert times == {name: round(measured[f"qrl train {name} --seed 100 --seeds 1"]) for name in ("hover", "circle")}
+
+
+def test_the_gallery_is_of_the_presets_that_ship_or_says_so() -> None:
+    """Each preset's run has as many steps as its preset, or a note at the head says that the page is older."""
+    page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    runs = re.findall(r"`qrl train (\w+) --seeds 1(?: --preset (\w+))?`,\s([\d,]+) steps", page)
+    assert sorted(preset or task for task, preset, _ in runs) == sorted(
+        [f"{task}{suffix}" for task in ("pendulum", "hover", "circle") for suffix in ("", "_ppo")]
+    )
+    stale = []
+    for task, preset, steps in runs:
+        config = Config.preset(preset or task)
+        if int(steps.replace(",", "")) != config.num_unrolls * config.steps_per_unroll:
+            stale.append(preset or task)
+    head = page[: page.index("\n## ")]
+    assert not stale or "**Figures of the first version**" in head, stale
+
+
 def test_presets_named_in_pages_exist() -> None:
     for page in PAGES:
         for name in re.findall(r"--preset (\w+)", page.read_text(encoding="utf-8")):

@@ -1,13 +1,13 @@
 """Brax's PPO on our own environments: `brax_ppo.py pendulum|hover|circle --seed N [--steps N]`.
 
 Brax ships no settings for a torque-limited pendulum. Those of its `inverted_pendulum` notebook (reward scale 10, 2,048
-lanes, 2M steps) do not suit a CPU; PENDULUM has fewer lanes, a higher step size and a reward scaled to suit, found by
-hand. QUADROTOR is the same with more lanes and a longer horizon, and no more tuned than that. Circle's differs in the
-length of its episodes, which is that of qrl's preset.
+environments, 2M steps) do not suit a CPU; PENDULUM has fewer environments, a higher learning rate and another reward
+scale, tuned by hand. QUADROTOR is the same with more environments, longer unrolls and a higher discount, not tuned
+further. The circle's has another episode length, that of qrl's preset.
 
-Brax restarts a lane from that lane's own first state, so that a run would see as many starts as it has lanes: here it
-draws all anew whenever an episode's time is up. And an end that is no termination is told to it as the truncation that
-it is (`Truncating`).
+Brax resets an environment to its own first state, so that a run would see as many starts as it has environments: on
+hover and circle `num_resets_per_eval` draws new ones after each episode's length. An end out of bounds is passed on as
+the truncation that it is (`Truncating`).
 """
 
 import argparse
@@ -45,33 +45,35 @@ PENDULUM: dict[str, Any] = {
 }
 QUADROTOR: dict[str, Any] = PENDULUM | {"num_envs": 256, "batch_size": 64, "unroll_length": 25, "discounting": 0.98}
 EPISODE_STEPS = {"hover": 200, "circle": 600}
-EPISODES_A_CHECK = {"hover": 10, "circle": 3}
+EPISODES_PER_CHECK = {"hover": 10, "circle": 3}
 NETWORKS: dict[str, Any] = {"policy_hidden_layer_sizes": (64, 64), "value_hidden_layer_sizes": (64, 64)}
 
 Policy = tuple[Callable[[Any, jax.Array], jax.Array], Any]  # of (params, observations), and params
 
 
 class Solved(Exception):
-    """Thrown through `train`, which offers no other way to end early."""
+    """Raised through `train`, which offers no other way to stop early."""
 
 
 def add_device_put_replicated_shim() -> None:
-    """Brax 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 no longer has: a copy on each device."""
+    """Brax 0.14.2 calls `jax.device_put_replicated`, which JAX 0.10 has removed: a copy on each device."""
 
     def device_put_replicated(tree: Any, devices: list[Any]) -> Any:
-        apart = NamedSharding(Mesh(np.array(devices), ("copy",)), P("copy"))
-        return jax.tree.map(lambda x: jax.device_put(jnp.broadcast_to(x, (len(devices), *jnp.shape(x))), apart), tree)
+        sharding = NamedSharding(Mesh(np.array(devices), ("copy",)), P("copy"))
+        return jax.tree.map(
+            lambda x: jax.device_put(jnp.broadcast_to(x, (len(devices), *jnp.shape(x))), sharding), tree
+        )
 
     if not hasattr(jax, "device_put_replicated"):
         jax.device_put_replicated = device_put_replicated  # pyright: ignore[reportAttributeAccessIssue]
 
 
 class Truncating(envs.Wrapper):
-    """Tells Brax that episodes which our environments end out of bounds are truncated.
+    """Marks episodes that our environments end out of bounds as truncated.
 
-    Brax knows of time limits alone. It would take such an end for a termination, worth 0 ever after; where rewards are
-    below 0, that pays a policy for fleeing. To stand outside its own wrappers, which set `truncation` at every step and
-    leave `info` alone when they reset.
+    Brax truncates at time limits only. It would take such an end for a termination with a value of 0; where rewards are
+    negative, that pays a policy for leaving the bounds. It wraps Brax's own wrappers, which set `truncation` at every
+    step and keep `info` at resets.
     """
 
     def step(self, state: Any, action: jax.Array) -> Any:
@@ -80,19 +82,19 @@ class Truncating(envs.Wrapper):
         return state.replace(info={**state.info, "truncation": jnp.maximum(state.info["truncation"], own)})
 
 
-def wrapped(env: Any, **how: Any) -> Truncating:
-    """As Brax wraps environments for training, and told of their own truncations."""
-    return Truncating(envs.training.wrap(env, **how))
+def wrap(env: Any, **settings: Any) -> Truncating:
+    """As Brax wraps environments for training, with their own truncations."""
+    return Truncating(envs.training.wrap(env, **settings))
 
 
-def pendulum_judged(policy: Policy) -> Act:
+def numpy_policy(policy: Policy) -> Act:
     """The deterministic policy as a function of observations in NumPy."""
     act, params = policy
     return lambda observation: np.asarray(act(params, jnp.asarray(observation, jnp.float32)))
 
 
 def flights(env: Any) -> Callable[[Policy], dict[str, float]]:
-    """What 1,000 deterministic flights measure, as `qrl evaluate` has it; compiled once."""
+    """Measures of 1,000 deterministic flights, as `qrl evaluate` takes them; compiled once."""
     keys = evaluation_starts()
     fly = jax.jit(
         lambda act, params: evaluate.fly(env, partial(act, params), keys, env.episode_steps), static_argnums=0
@@ -101,19 +103,19 @@ def flights(env: Any) -> Callable[[Policy], dict[str, float]]:
 
 
 def learn(task: str, seed: int, steps: int, settings: dict[str, Any], judge: Judge, every: int) -> None:
-    """Train until the judge is content, a check after every `every` steps; at most `steps`, in whole checks."""
+    """Train until solved, with a check every `every` steps; at most `steps`, rounded down to a check."""
     env = envs.get_environment(task)
     checks = max(1, steps // every)
 
-    made: list[Any] = []  # the policy's function, which is the same at every check
+    compiled: list[Any] = []  # the policy's function, the same at every check
 
-    def handed(step: int, make_policy: Any, params: Any) -> None:
+    def check(step: int, make_policy: Any, params: Any) -> None:
         if step == 0:
             return
-        if not made:
-            made.append(jax.jit(lambda p, o: make_policy(p, deterministic=True)(o, jax.random.PRNGKey(0))[0]))
-        policy = made[0], params
-        if judge.check(step, pendulum_judged(policy) if task == "pendulum" else policy):
+        if not compiled:
+            compiled.append(jax.jit(lambda p, o: make_policy(p, deterministic=True)(o, jax.random.PRNGKey(0))[0]))
+        policy = compiled[0], params
+        if judge.check(step, numpy_policy(policy) if task == "pendulum" else policy):
             raise Solved
 
     judge.start()
@@ -124,8 +126,8 @@ def learn(task: str, seed: int, steps: int, settings: dict[str, Any], judge: Jud
             num_evals=checks + 1,
             run_evals=False,
             seed=seed,
-            policy_params_fn=handed,
-            wrap_env_fn=wrapped,
+            policy_params_fn=check,
+            wrap_env_fn=wrap,
             network_factory=partial(networks.make_ppo_networks, **NETWORKS),
             **settings,
         )
@@ -142,7 +144,7 @@ def main() -> None:
     if args.task == "pendulum":
         learn("pendulum", args.seed, steps, PENDULUM, pendulum_judge().listen_to_jax(), every=20_480)
     else:
-        steps_of, episodes = EPISODE_STEPS[args.task], EPISODES_A_CHECK[args.task]
+        steps_of, episodes = EPISODE_STEPS[args.task], EPISODES_PER_CHECK[args.task]
         settings = QUADROTOR | {"episode_length": steps_of, "num_resets_per_eval": episodes}
         judge = success_judge(flights(envs.get_environment(args.task))).listen_to_jax()
         learn(args.task, args.seed, steps, settings, judge, every=episodes * steps_of * QUADROTOR["num_envs"])

@@ -1,8 +1,8 @@
-"""What Brax does in a second with our hover: `brax_speed.py [--only acting training] --seed N`.
+"""Throughput of Brax on our hover: `brax_speed.py [--only acting training] --seed N`.
 
-acting     its training wrappers under a sampling policy 64-64: `acting.generate_unroll`
-training   environment steps of the whole of `ppo.train` at its defaults (16 minibatches of 32 unrolls of 10 steps, two
-           passes), networks 64-64, no evaluation; the median of its intervals after the first two, which compile
+acting     its training wrappers with a stochastic policy 64-64: `acting.generate_unroll`
+training   environment steps/s of `ppo.train` at its defaults (16 minibatches of 32 unrolls of 10 steps, two passes),
+           networks 64-64, without evaluation; median over intervals after the first two, which compile
 """
 
 import argparse
@@ -34,9 +34,11 @@ def acting(lanes: int, seed: int) -> None:
     @jax.jit
     def unroll(carry: Any) -> Any:
         state, key, _ = carry
-        key, mine = jax.random.split(key)
-        state, seen = brax_acting.generate_unroll(env, state, policy, mine, UNROLL_STEPS, extra_fields=("truncation",))
-        return state, key, seen
+        key, subkey = jax.random.split(key)
+        state, data = brax_acting.generate_unroll(
+            env, state, policy, subkey, UNROLL_STEPS, extra_fields=("truncation",)
+        )
+        return state, key, data
 
     state = jax.jit(env.reset)(jax.random.split(key, lanes))
     rate(f"acting, {lanes:,} lanes", lanes * UNROLL_STEPS, unroll, (state, key, None), jax.block_until_ready)
@@ -56,7 +58,7 @@ def training(lanes: int, seed: int) -> None:
         network_factory=partial(networks.make_ppo_networks, **NETWORKS),
     )
     (steps, seconds) = np.diff(np.array(times), axis=0).T
-    for figure in TRAINING.values():  # one measurement: both rows of qrl's are held against it
+    for figure in TRAINING.values():  # one measurement, compared with both rows of qrl's
         report({"figure": figure, "per_second": float(np.median(steps[2:] / seconds[2:]))})
 
 

@@ -1,7 +1,7 @@
-"""crazyflow's physics alone on a CPU, in steps a second: `crazyflow_physics.py first_principles|so_rpy --seed N`.
+"""Steps/s of crazyflow's physics on a CPU: `crazyflow_physics.py first_principles|so_rpy --seed N`.
 
-first_principles (rotors, drag and all) is told rotor speeds and is the nearest to our quadrotor's step, of which it
-does more; so_rpy, fitted to flights, is told attitudes and thrust. Symplectic Euler, as ours, at 100 Hz.
+first_principles (rotors and drag included) takes rotor speeds and is closest to our quadrotor's step, though it
+computes more; so_rpy, fitted to flights, takes attitude and thrust. Symplectic Euler, as ours, at 100 Hz.
 """
 
 import argparse

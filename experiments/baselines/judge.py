@@ -1,12 +1,11 @@
-"""How every contestant is judged and timed: the pendulum of 1,000 starts, and a clock that the checks stop.
+"""How every contestant is evaluated and timed: the pendulum's 1,000 starts, and a clock that is paused for checks.
 
-NumPy alone, for each peer imports it into an environment of its own. A contestant trains with the clock running and
-now and then hands over its policy (`Judge.check`); what a check takes is in no figure, and each one becomes a line of
-JSON on standard output:
+NumPy only: each baseline imports it in an environment of its own. A contestant trains with the clock running, and at
+intervals passes its policy to `Judge.check`. The time of a check is in no figure; each check prints a line of JSON:
 
-train_seconds    running, without what was compiled meanwhile
-compile_seconds  JAX: all spans of tracing, lowering and compiling while the clock ran, overlaps counted once, as
-                 `jax.monitoring` tells; elsewhere what the script marks with `Judge.compiling`
+train_seconds    training, without compilation
+compile_seconds  JAX: tracing, lowering and compiling while the clock ran, overlaps counted once, as `jax.monitoring`
+                 reports them; elsewhere what the script marks with `Judge.compiling`
 total_seconds    since the process was started: interpreter, imports, compilation and training
 """
 
@@ -22,20 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Act = Callable[[Array], Any]  # observations [n, 3] -> actions [n, 1] in [−1, 1]: torque over the greatest torque
+Act = Callable[[Array], Any]  # observations [n, 3] -> actions [n, 1] in [−1, 1]: torque over the maximum torque
 
-LATTICE, STEPS = (40, 25), 200  # starts, of angle and rate
+GRID, STEPS = (40, 25), 200  # starts, of angle and rate
 GRAVITY, MASS, LENGTH, MAX_TORQUE, MAX_RATE, DT = 10.0, 1.0, 1.0, 2.0, 8.0, 0.05
 
 
 def pendulum_starts() -> tuple[Array, Array]:
-    """The 1,000 starts: the middles of a lattice's cells over θ in ±π and rates in ±1; [n] and [n].
+    """The 1,000 starts: the centers of a grid's cells over θ in ±π and rates in ±1; [n] and [n].
 
-    Drawn at random, the mean return over as many differs by 2.4 (one deviation) from draw to draw, whatever the policy;
-    over these it is within 0.3 of what it is over all starts.
+    Over as many random starts the mean return has a standard deviation of 2.4, whatever the policy; over these it is
+    within 0.3 of the mean over all starts.
     """
-    angle, rate = (2.0 * (np.arange(count) + 0.5) / count - 1.0 for count in LATTICE)
-    return np.repeat(np.pi * angle, LATTICE[1]), np.tile(rate, LATTICE[0])
+    angle, rate = (2.0 * (np.arange(count) + 0.5) / count - 1.0 for count in GRID)
+    return np.repeat(np.pi * angle, GRID[1]), np.tile(rate, GRID[0])
 
 
 def pendulum_step(theta: Array, rate: Array, action: Array) -> tuple[Array, Array, Array]:
@@ -43,8 +42,8 @@ def pendulum_step(theta: Array, rate: Array, action: Array) -> tuple[Array, Arra
     torque = MAX_TORQUE * np.clip(action, -1.0, 1.0)
     upright = (theta + np.pi) % (2.0 * np.pi) - np.pi
     reward = -(upright**2 + 0.1 * rate**2 + 0.001 * torque**2)
-    pull = 1.5 * GRAVITY / LENGTH * np.sin(theta) + 3.0 / (MASS * LENGTH**2) * torque
-    rate = np.clip(rate + DT * pull, -MAX_RATE, MAX_RATE)
+    acceleration = 1.5 * GRAVITY / LENGTH * np.sin(theta) + 3.0 / (MASS * LENGTH**2) * torque
+    rate = np.clip(rate + DT * acceleration, -MAX_RATE, MAX_RATE)
     return theta + DT * rate, rate, reward
 
 
@@ -71,7 +70,7 @@ def covered(spans: list[tuple[float, float]]) -> float:
 
 
 class Judge:
-    """A contestant's clock. It stands still until `start`; `check` stops it, judges, reports, and lets it go on."""
+    """A contestant's clock, paused until `start`; `check` pauses it, evaluates, reports, and resumes it."""
 
     def __init__(self, measure: Callable[[Any], dict[str, float]], solved: Callable[[dict[str, float]], bool]) -> None:
         self._measure = measure
@@ -83,26 +82,26 @@ class Judge:
         self._budget = float(os.environ.get("BENCH_BUDGET_SECONDS", "inf"))
 
     def listen_to_jax(self) -> "Judge":
-        """Count what JAX compiles from here on."""
+        """Count what JAX compiles from now on."""
         import jax  # in the contestant's environment, if it has one
 
-        def heard(event: str, duration_secs: float, **_: str | int) -> None:
+        def listener(event: str, duration_secs: float, **_: str | int) -> None:
             if event.startswith("/jax/core/compile/"):
                 now = time.time()
                 self._spans.append((now - duration_secs, now))
 
-        jax.monitoring.register_event_duration_secs_listener(heard)
+        jax.monitoring.register_event_duration_secs_listener(listener)
         return self
 
     @contextmanager
     def compiling(self) -> Iterator[None]:
-        """What is done here is compilation, whether the clock runs or not."""
-        begun = time.time()
+        """The body is compilation, whether the clock runs or not."""
+        start = time.time()
         yield
-        self._spans.append((begun, time.time()))
+        self._spans.append((start, time.time()))
 
     def start(self) -> None:
-        """Training begins. What was compiled until here counts as compilation."""
+        """Start the clock; what was compiled before counts as compilation."""
         self._compile += covered(self._spans)
         self._spans.clear()
         self._since = time.time()
@@ -117,14 +116,14 @@ class Judge:
         self._since = None
 
     def check(self, steps: int, policy: Any) -> bool:
-        """Judge a policy after so many environment steps; whether the contestant is done: solved, or out of time."""
+        """Evaluate the policy after `steps` environment steps; whether to stop: solved, or out of time."""
         self.pause()
-        begun = time.time()
+        start = time.time()
         found = self._measure(policy)
-        total = begun - self._spawned - self._checks
+        total = start - self._spawned - self._checks
         clocks = {"train_seconds": self._train, "compile_seconds": self._compile, "total_seconds": total}
         report({"steps": int(steps), **clocks, **found})
-        self._checks += time.time() - begun
+        self._checks += time.time() - start
         self._spans.clear()
         self._since = time.time()
         return self._solved(found) or total >= self._budget
@@ -143,6 +142,6 @@ def success_judge(success: Callable[[Any], dict[str, float]]) -> Judge:
 
 
 def report(line: dict[str, Any]) -> None:
-    """A line for the harness; a number that is not finite becomes null, for JSON has none."""
+    """Print a line for the harness; a number that is not finite becomes null, as JSON has none."""
     plain = {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in line.items()}
     print("BENCH " + json.dumps(plain), flush=True)

@@ -1,10 +1,9 @@
 """The command as a user has it, defaults as they ship: `qrl_command.py TASK --seed N`.
 
-`qrl train TASK` in a process of its own, with an empty compile cache, then `qrl evaluate` from 1,000 fresh starts: the
-policy at the end is judged, not the first that was good enough. So are the policies of the last 5 checkpoints, of which
-`worst_of_5_…` is the greatest steady-state error, and a quadrotor's off its nominal conditions. train_seconds are the
-run's own; total_seconds are those of the whole `qrl train`, checkpoints, reports and pictures included; what is neither
-is `other_seconds`.
+`qrl train TASK` in a process of its own, with an empty compile cache, then `qrl evaluate` of the final policy, not of
+the first that was good enough, from 1,000 fresh starts. `worst_of_5_…` is the maximum steady-state error of the last 5
+checkpoints; a quadrotor is evaluated off nominal too. train_seconds are the run's own; total_seconds are those of the
+`qrl train` process, checkpoints, reports and plots included; `other_seconds` are the difference.
 """
 
 import argparse
@@ -45,9 +44,9 @@ def main() -> None:
         env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "cache")}
 
         def qrl(*words: str) -> float:
-            begun = time.time()
+            start = time.time()
             subprocess.run([sys.executable, "-m", "qrl", *words], env=env, check=True, stdout=sys.stderr)
-            return time.time() - begun
+            return time.time() - start
 
         seconds = qrl("train", args.task, "--seed", str(args.seed), "--out", str(out))
         off = ["--off-nominal"] if args.task in QUADROTORS else []

@@ -1,7 +1,7 @@
 """Seconds from the command to the first updates: `qrl_startup.py [TASK] --seed N`.
 
-`qrl train TASK` asked for as many steps as learning waits for, and one unroll's updates; timed until its first report
-is on the screen (which flies 100 starts), first with an empty compile cache and then with what that run has left.
+`qrl train TASK` for the steps of the warm-up and one unroll's updates, timed until its first report is printed (which
+flies 100 starts), first with an empty compile cache and then with the one that this run has filled.
 """
 
 import argparse
@@ -23,13 +23,13 @@ def first_report(task: str, seed: int, out: Path, cache: Path) -> float:
     steps = config["warmup_unrolls"] * config["num_envs"] * config["unroll_length"]
     words = ["train", task, "--seed", str(seed), "--num-timesteps", str(steps), "--num-evals", "1", "--out", str(out)]
     env = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(cache), "PYTHONUNBUFFERED": "1"}
-    begun = time.time()
+    start = time.time()
     command = [sys.executable, "-m", "qrl", *words]
     with subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         for line in process.stdout:
             if line.strip()[:1].isdigit():
-                seconds = time.time() - begun
+                seconds = time.time() - start
                 process.send_signal(signal.SIGKILL)
                 return seconds
     raise SystemExit(f"qrl {' '.join(words)}: no report")

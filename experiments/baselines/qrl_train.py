@@ -1,7 +1,7 @@
 """qrl itself, in one process: `qrl_train.py pendulum|hover|circle --seed N [--preset NAME] [--no-apg] [--checks N]`.
 
-The preset (TASK_fast where it ships, else the task's own) says how many steps there are: step size and noise follow its
-schedule, so that a policy is best at its end. It is checked `--checks` times on the way, as the other contestants are.
+The preset (TASK_fast where it ships, else the task's own) sets the number of steps: learning rate and sigma follow its
+schedule, so that a policy is best at the end. It is checked `--checks` times, as the other contestants are.
 """
 
 import argparse
@@ -28,7 +28,7 @@ from qrl.training.trainer import Trainer, make_trainer
 def contestant(
     task: str, preset: str | None, seed: int, flags: dict[str, Any]
 ) -> tuple[Trainer, Any, record.RunConfig]:
-    """What trains, at which point, and how it was asked for."""
+    """Trainer, inputs of its one member, and config."""
     fast = f"{task}_fast"
     name = preset or (fast if fast in preset_names() else task)
     run = request.run_config(task, None, record.ConfigFile(learner=load_preset(name)), flags, seed, 1)
@@ -38,8 +38,8 @@ def contestant(
     return trainer, stack([member_inputs(env, run.learner)]), run
 
 
-def pendulum_judged(trainer: Trainer) -> Callable[[Any], Act]:
-    """The policy that ships as a function of observations in NumPy; compiled once."""
+def numpy_policy(trainer: Trainer) -> Callable[[Any], Act]:
+    """The deployed policy as a function of observations in NumPy; compiled once."""
     spec, hyper = trainer.setup.spec, trainer.config.hyperparameters
 
     @jax.jit
@@ -54,7 +54,7 @@ def main() -> None:
     parser.add_argument("task", choices=["pendulum", "hover", "circle"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--preset")
-    parser.add_argument("--no-apg", action="store_true", help="the paper's method to the end")
+    parser.add_argument("--no-apg", action="store_true", help="without APG")
     parser.add_argument("--checks", type=int, default=20)
     args = parser.parse_args()
     flags = {"apg_fraction": 0.0} if args.no_apg else {}
@@ -66,18 +66,19 @@ def main() -> None:
         return summarize(jax.tree.map(lambda x: x[0], trainer.fly(learners, points, keys)))
 
     judge: Judge = pendulum_judge() if args.task == "pendulum" else success_judge(flights)
-    judged = pendulum_judged(trainer)
+    numpy_policy_of = numpy_policy(trainer)
     judge.listen_to_jax().start()
     states = trainer.init(driver.seeds(run.seed, 1), points)
-    advance, climb = driver.compile_train(trainer, states, points), driver.compile_apg(trainer, states, points)
+    train, apg = driver.compile_train(trainer, states, points), driver.compile_apg(trainer, states, points)
     pieces = min(args.checks, config.num_unrolls)
     for until in sorted(
         {round(config.num_unrolls * (i + 1) / pieces) for i in range(pieces)} | {config.learning_unrolls}
     ):
-        on = advance if until <= config.learning_unrolls else climb
-        states = jax.block_until_ready(on(states, points, np.int32(until)))
-        learners = states.learner
-        policy = judged(jax.tree.map(lambda x: x[0], trainer.gather(learners))) if args.task == "pendulum" else learners
+        program = train if until <= config.learning_unrolls else apg
+        states = jax.block_until_ready(program(states, points, np.int32(until)))
+        policy: Any = states.learner
+        if args.task == "pendulum":
+            policy = numpy_policy_of(jax.tree.map(lambda x: x[0], trainer.gather(policy)))
         if judge.check(until * config.steps_per_unroll, policy):
             break
 

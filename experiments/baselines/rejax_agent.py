@@ -1,7 +1,7 @@
 """rejax on gymnax's Pendulum-v1: `rejax_agent.py ppo|sac --seed N [--steps N]`.
 
-Settings: rejax's own `configs/gymnax/pendulum.yaml` (version 0.1.3), the number of steps aside. It trains in pieces of
-one compiled program, its own evaluation switched off; the policy judged is the mean of its distribution.
+Settings: rejax's own `configs/gymnax/pendulum.yaml` (version 0.1.3), except for the number of steps. It trains in calls
+of one compiled program, with its own evaluation switched off; what is evaluated is the mean of its distribution.
 """
 
 import argparse

@@ -1,6 +1,6 @@
 """rl-tools' SAC, the package on PyPI, on Gymnasium's Pendulum-v1: `rltools_sac.py --seed N [--steps N]`.
 
-Settings: the package's own defaults, made for this task. Compilation is that of its C++, anew in each run.
+Settings: the package's own defaults, made for this task. Compilation is that of its C++, in each run.
 """
 
 import argparse
@@ -18,7 +18,7 @@ CHECK_EVERY, FIRST_CHECK = 1_000, 3_000
 
 
 def batched(state: Any) -> Any:
-    """The policy for many observations: it answers one at a time, and before its tanh."""
+    """The policy for a batch of observations; rltools' own takes one, and returns the action before its tanh."""
 
     def act(observations: Array) -> Array:
         return np.tanh([state.action(o) for o in observations])

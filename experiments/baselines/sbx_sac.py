@@ -15,7 +15,7 @@ CHECK_EVERY, FIRST_CHECK = 500, 2_000
 
 
 class Checked(BaseCallback):
-    """Hand the policy over every so many steps."""
+    """Check the policy every CHECK_EVERY steps."""
 
     def __init__(self, judge: Judge) -> None:
         super().__init__()

@@ -6,7 +6,7 @@ GROUPS = {
     "pendulum": "Pendulum-v1, until the mean return of 1,000 starts reaches −150",
     "hover": "hover, until 99 % of 1,000 starts succeed",
     "circle": "circle, until 99 % of 1,000 starts succeed",
-    "commands": "whole commands with the defaults that ship, the last policy evaluated",
+    "commands": "complete commands with the shipped defaults, the final policy evaluated",
     "speed": "steps and samples a second",
 }
 
@@ -54,7 +54,7 @@ def key(contestant: Contestant) -> str:
 
 
 def chosen(words: list[str]) -> list[Contestant]:
-    """The contestants named by `words` (groups or keys), in the table's order; raises ValueError."""
+    """The contestants named by `words` (groups or keys), in the order of CONTESTANTS; raises ValueError."""
     known = {key(contestant) for contestant in CONTESTANTS} | GROUPS.keys()
     for word in words:
         if word not in known:

@@ -1,4 +1,4 @@
-"""The ratios as one plot: how many times qrl's time another takes, or how many times its rate qrl reaches."""
+"""The ratios as one plot: each contestant's time over qrl's, and qrl's rate over each contestant's."""
 
 import math
 import textwrap
@@ -14,9 +14,9 @@ from experiments.bench.tables import BARS, QRL, Run, Spread, by_seed, figures, n
 
 COLORS = {"training": "#0072B2", "total": "#E69F00", "speed": "#009E73"}  # of Okabe and Ito
 NAMES = {
-    "training": "training seconds, theirs / qrl's",
-    "total": "seconds from start to solved, theirs / qrl's",
-    "speed": "steps a second, qrl's / theirs",
+    "training": "training seconds, contestant / qrl",
+    "total": "seconds from start to solved, contestant / qrl",
+    "speed": "steps a second, qrl / contestant",
 }
 
 
@@ -31,36 +31,38 @@ def bars(runs: list[Run]) -> list[Bar]:
     """A bar for each ratio that is there; for one that mostly failed, a lower bound from its budget."""
     found: list[Bar] = []
     for group in BARS:
-        mine = [run for run in runs if run["group"] == group]
-        for who in dict.fromkeys(run["contestant"] for run in mine if run["contestant"] != QRL):
+        selected = [run for run in runs if run["group"] == group]
+        for contestant in dict.fromkeys(run["contestant"] for run in selected if run["contestant"] != QRL):
             for kind, clock in (("training", "train_seconds"), ("total", "total_seconds")):
-                theirs, ours = by_seed(mine, who, clock), by_seed(mine, QRL, clock)
-                spent = {r["seed"]: r["lines"][-1][clock] for r in mine if r["contestant"] == who and r["lines"]}
-                ratio = ratios(theirs, ours)
+                other, ours = by_seed(selected, contestant, clock), by_seed(selected, QRL, clock)
+                spent = {
+                    r["seed"]: r["lines"][-1][clock] for r in selected if r["contestant"] == contestant and r["lines"]
+                }
+                ratio = ratios(other, ours)
                 bound = ratio is not None and not math.isfinite(ratio.median)
-                if ratio and not math.isfinite(ratio.greatest):
+                if ratio and not math.isfinite(ratio.max):
                     ratio = ratios(
-                        {s: v if math.isfinite(v) else spent.get(s, math.nan) for s, v in theirs.items()}, ours
+                        {s: v if math.isfinite(v) else spent.get(s, math.nan) for s, v in other.items()}, ours
                     )
                 if ratio and math.isfinite(ratio.median):
-                    found.append(Bar(f"{group}: {who}", kind, ratio, bound))
+                    found.append(Bar(f"{group}: {contestant}", kind, ratio, bound))
     rates = figures([run for run in runs if run["group"] == "speed"])
     for figure, values in rates.items():
         ours = rates.get(strip_device_suffix(figure), {}).get(QRL, {})
-        for who in values:
-            if who != QRL and (ratio := ratios(ours, values[who])):
-                found.append(Bar(f"{figure}: {who}", "speed", ratio, False))
+        for contestant in values:
+            if contestant != QRL and (ratio := ratios(ours, values[contestant])):
+                found.append(Bar(f"{figure}: {contestant}", "speed", ratio, False))
     return found
 
 
 def plot(path: Path, runs: list[Run]) -> None:
-    """Horizontal bars on a logarithmic axis, whiskers from least to greatest; nothing where there is no ratio."""
+    """Horizontal bars on a logarithmic axis, whiskers from min to max; no file where there is no ratio."""
     found = bars(runs)
     if not found:
         return
     figure, axes = plt.subplots(figsize=(9.0, 1.4 + 0.3 * len(found)), layout="constrained")
     for y, bar in enumerate(found):
-        low, high = bar.ratio.median - bar.ratio.least, bar.ratio.greatest - bar.ratio.median
+        low, high = bar.ratio.median - bar.ratio.min, bar.ratio.max - bar.ratio.median
         axes.barh(
             y,
             bar.ratio.median - 1.0,
@@ -74,9 +76,7 @@ def plot(path: Path, runs: list[Run]) -> None:
             capsize=2,
         )
         text = f"{'> ' if bar.bound else ''}{number(bar.ratio.median)}×"
-        axes.annotate(
-            text, (max(bar.ratio.greatest, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8
-        )
+        axes.annotate(text, (max(bar.ratio.max, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8)
     axes.set_xscale("log")
     axes.axvline(1.0, color="#333333", linewidth=1.0)
     axes.set_yticks(range(len(found)), [textwrap.fill(bar.label, 48) for bar in found], fontsize=8)

@@ -43,7 +43,7 @@ FINISHED = ("done", OUT_OF_TIME)
 def main(argv: list[str] | None = None) -> int:
     parser = Parser("bench", __doc__)
     parser.add_argument("--out", type=Path, default=Path("experiments/out/bench"), metavar="FOLDER")
-    parser.add_argument("--environments", type=Path, default=Path("experiments/out/peers"), metavar="FOLDER")
+    parser.add_argument("--environments", type=Path, default=Path("experiments/out/baselines"), metavar="FOLDER")
     parser.add_argument(
         "--only", nargs="+", default=[], help="groups or contestants, as --list has them", metavar="NAME"
     )
@@ -92,7 +92,7 @@ def bench(contestants: list[Contestant], args: argparse.Namespace) -> None:
 
 
 def installed(
-    contestants: list[Contestant], peers: Path, folder: Path
+    contestants: list[Contestant], requirements: Path, folder: Path
 ) -> tuple[dict[str | None, Path], dict[str, str]]:
     """The interpreter of each environment, and the error of each that cannot be installed."""
     pythons: dict[str | None, Path] = {None: Path(sys.executable)}
@@ -100,7 +100,7 @@ def installed(
     for name in dict.fromkeys(c.environment for c in contestants if c.environment):
         print(f"environment {name}", flush=True)
         try:
-            pythons[name] = python_of(peers / f"{name}.txt", (folder / name).absolute())
+            pythons[name] = python_of(requirements / f"{name}.txt", (folder / name).absolute())
         except NotInstalled as error:
             absent[name] = str(error)
             print(f"{name}: not installed, and skipped: {error}", flush=True)
@@ -154,16 +154,21 @@ def run_contestant(contestant: Contestant, python: Path, seed: int, budget_secon
         env["JAX_COMPILATION_CACHE_DIR"] = str(cache.absolute())
     load = round(os.getloadavg()[0], 2)  # other work on the machine
     script = [str(python), str(BASELINES / contestant.script), *contestant.words, "--seed", str(seed)]
-    out, err, outcome = in_time(script, env, budget_seconds + GRACE_SECONDS)
+    out, err, outcome = run_with_timeout(script, env, budget_seconds + GRACE_SECONDS)
     lines = [json.loads(line.removeprefix(MARK)) for line in out.splitlines() if line.startswith(MARK)]
     error = (err.strip().splitlines() or [""])[-1][:300] if outcome.startswith("exit") else ""
-    who = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
-    how = {"command": command(contestant), "budget_seconds": budget_seconds, "commit": records.commit(), "load": load}
-    how["fingerprint"] = run_fingerprint(contestant)
-    return {**who, **how, "outcome": outcome, "error": error, "lines": lines}
+    identity = {"contestant": contestant.name, "group": contestant.group, "seed": seed}
+    origin = {
+        "command": command(contestant),
+        "budget_seconds": budget_seconds,
+        "commit": records.commit(),
+        "load": load,
+    }
+    origin["fingerprint"] = run_fingerprint(contestant)
+    return {**identity, **origin, "outcome": outcome, "error": error, "lines": lines}
 
 
-def in_time(words: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:
+def run_with_timeout(words: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:
     """(standard output, standard error, how it ended) of a command in a temporary working directory."""
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with (

@@ -15,32 +15,31 @@ from experiments.output import table
 Run = dict[str, Any]
 CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
 BARS = {"pendulum": ("return_mean", -150.0), "hover": ("success", 0.99), "circle": ("success", 0.99)}
-ONE_DEVICE, TWO_DEVICES = ", one device", ", two devices"  # how such a contestant's name, and so its figures, end
-EASIER_PENDULUM = -160.0  # at which the field's figures were taken
+ONE_DEVICE, TWO_DEVICES = ", one device", ", two devices"  # suffixes of a contestant's name, and so of its figures
+EASIER_PENDULUM = -160.0  # the threshold of published figures
 TUNED = (
-    "**Whose settings.** qrl races with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
-    " `circle_fast`); its commands use the presets that ship as these tasks' defaults. On hover and circle these end"
-    " with the gradient of flights through the simulator (APG), which no other contestant here uses; such a step counts"
-    " as a step; *qrl without APG* is the same presets without it. qrl makes a device of each core, or has XLA use one"
-    " thread where its minibatches are small, as `qrl train` does; every other contestant has the devices and threads"
-    " that it chooses. Brax PPO's were tuned by hand for the pendulum, as"
-    " Brax ships none that suit; on hover and circle it has the same with more lanes and a longer horizon, and no"
-    " search was made there. rejax: its own for this task. sbx: the RL Zoo's for this task. rltools: the package's"
-    " defaults, made for this task. Rates: in a call qrl acts for 16,384 × 50 steps, or moves as many;"
-    " another makes an unroll."
+    "**Settings.** qrl trains with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
+    " `circle_fast`); its commands use the tasks' default presets. On hover and circle these end with the analytic"
+    " policy gradient (APG), which no other contestant here uses; its environment steps count as steps; *qrl without"
+    " APG* is the same presets without it. qrl makes a device of each core, or has XLA use one thread where its"
+    " minibatches are small, as `qrl train` does; every other contestant has its own default devices and threads. Brax"
+    " PPO's settings were tuned by hand for the pendulum, as Brax ships none that suit; on hover and circle it has the"
+    " same with more environments, longer unrolls and a higher discount, without a search there. rejax: its own for"
+    " this task. sbx: the RL Zoo's for this task. rltools: the package's defaults, made for this task. Rates: a call of"
+    " qrl makes 16,384 × 50 environment steps; one of the others makes an unroll."
 )
 
 
 class Spread(NamedTuple):
-    """Median and range; infinite where a run did not come so far."""
+    """Median and range; infinite where a run did not reach it."""
 
     median: float
-    least: float
-    greatest: float
+    min: float
+    max: float
 
 
 def spread(values: Iterable[float]) -> Spread:
-    """Of at least one value; the median of an even number is the mean of two."""
+    """Of at least one value."""
     ordered = np.sort(np.fromiter(values, float))
     return Spread(float(np.median(ordered)), float(ordered[0]), float(ordered[-1]))
 
@@ -57,17 +56,17 @@ def to_solve(run: Run, clock: str, bar: float | None = None) -> float:
     return math.inf if line is None else float(line.get(clock, math.nan))
 
 
-def ratios(theirs: dict[int, float], ours: dict[int, float]) -> Spread | None:
+def ratios(other: dict[int, float], ours: dict[int, float]) -> Spread | None:
     """Of values by seed, each over ours of the same round (run one after the other); None: no round has both.
 
     Where ours is infinite the ratio says nothing, and that round is left out.
     """
-    both = [theirs[seed] / ours[seed] for seed in theirs if seed in ours and 0 < ours[seed] < math.inf]
+    both = [other[seed] / ours[seed] for seed in other if seed in ours and 0 < ours[seed] < math.inf]
     return spread(both) if both else None
 
 
 def number(value: float) -> str:
-    """Three digits, or a dash for what never happened."""
+    """Three digits, or a dash for infinity and NaN."""
     if not math.isfinite(value):
         return "–"
     if value and abs(value) < 100:
@@ -76,12 +75,12 @@ def number(value: float) -> str:
 
 
 def cell(found: Spread | None, unit: str = "") -> str:
-    """median [least … greatest]; "not" where most runs did not come so far."""
+    """median [min … max]; "not" where most runs did not reach it."""
     if found is None:
         return "–"
     if not math.isfinite(found.median):
-        return "not" if not math.isfinite(found.least) else f"not [{number(found.least)}{unit} … –]"
-    return f"{number(found.median)}{unit} [{number(found.least)} … {number(found.greatest)}]"
+        return "not" if not math.isfinite(found.min) else f"not [{number(found.min)}{unit} … –]"
+    return f"{number(found.median)}{unit} [{number(found.min)} … {number(found.max)}]"
 
 
 def _names(runs: list[Run]) -> list[str]:
@@ -93,27 +92,35 @@ def by_seed(runs: list[Run], contestant: str, clock: str, bar: float | None = No
 
 
 def race(runs: list[Run], group: str) -> str:
-    """A group whose contestants train until they have solved the task."""
+    """The table of a group whose contestants train until the task is solved."""
     name, bar = BARS[group]
     easier = [EASIER_PENDULUM] if group == "pendulum" else []
     head = ["", "solved", "steps", "training [s]", "compiling [s]", "total [s]", "training / qrl", "total / qrl"]
     head += ["training [s] to −160"] * len(easier)
     rows = []
-    for who in _names(runs):
-        mine = [run for run in runs if run["contestant"] == who]
-        solved = sum(first_at(run, name, bar) is not None for run in mine)
-        row = [who, f"{solved} of {len(mine)}", *(cell(spread(by_seed(runs, who, c).values())) for c in CLOCKS)]
+    for contestant in _names(runs):
+        selected = [run for run in runs if run["contestant"] == contestant]
+        solved = sum(first_at(run, name, bar) is not None for run in selected)
+        row = [
+            contestant,
+            f"{solved} of {len(selected)}",
+            *(cell(spread(by_seed(runs, contestant, c).values())) for c in CLOCKS),
+        ]
         for clock in ("train_seconds", "total_seconds"):
-            row.append("" if who == QRL else cell(ratios(by_seed(runs, who, clock), by_seed(runs, QRL, clock)), "×"))
-        row += [cell(spread(by_seed(runs, who, "train_seconds", b).values())) for b in easier]
+            row.append(
+                ""
+                if contestant == QRL
+                else cell(ratios(by_seed(runs, contestant, clock), by_seed(runs, QRL, clock)), "×")
+            )
+        row += [cell(spread(by_seed(runs, contestant, "train_seconds", b).values())) for b in easier]
         rows.append(row)
     return table(head, rows)
 
 
 def commands(runs: list[Run]) -> str:
-    """Whole commands: everything that their last line holds, a row each."""
+    """The table of complete commands: a row for each measure of their last line."""
     names = list(dict.fromkeys(name for run in runs for name in _last(run)))
-    each = {who: [_last(run) for run in runs if run["contestant"] == who] for who in _names(runs)}
+    each = {contestant: [_last(run) for run in runs if run["contestant"] == contestant] for contestant in _names(runs)}
     rows = [[name.replace("_", " "), *(_of(lines, name) for lines in each.values())] for name in names]
     return table(["", *each], rows)
 
@@ -133,11 +140,11 @@ def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
     """
     found: dict[str, dict[str, dict[int, float]]] = {}
     for run in runs:
-        who, *how = run["contestant"].split(", ")
+        contestant, *how = run["contestant"].split(", ")
         for line in run["lines"]:
             value = line.get("per_second", line.get("seconds"))
             figure = ", ".join([line["figure"], *how])
-            found.setdefault(figure, {}).setdefault(who, {})[run["seed"]] = float(value)
+            found.setdefault(figure, {}).setdefault(contestant, {})[run["seed"]] = float(value)
     return found
 
 
@@ -146,9 +153,9 @@ def speed(runs: list[Run]) -> str:
     found, rows = figures(runs), []
     for figure, values in found.items():
         ours = found.get(strip_device_suffix(figure), {}).get(QRL, {})
-        for who, theirs in values.items():
-            ratio = None if who == QRL else ratios(ours, theirs)
-            rows.append([figure, who, cell(spread(theirs.values())), cell(ratio, "×") if ratio else ""])
+        for contestant, other in values.items():
+            ratio = None if contestant == QRL else ratios(ours, other)
+            rows.append([figure, contestant, cell(spread(other.values())), cell(ratio, "×") if ratio else ""])
     return table(["", "", "a second, or seconds", "qrl / this"], rows)
 
 
@@ -158,28 +165,28 @@ def strip_device_suffix(figure: str) -> str:
 
 
 def derived(runs: list[Run]) -> str:
-    """Ratios within a contestant: given devices over its own choice, and the cost of acting by number of lanes."""
+    """Ratios within a contestant: a given number of devices over its default, and the cost of acting by lanes."""
     found, rows = figures(runs), []
     for figure, values in found.items():
-        for who, given in values.items():
-            by_itself = found.get(strip_device_suffix(figure), {}).get(who, {})
+        for contestant, given in values.items():
+            by_itself = found.get(strip_device_suffix(figure), {}).get(contestant, {})
             if figure.endswith(TWO_DEVICES):
-                rows.append([f"{figure}, over its own choice", who, cell(ratios(given, by_itself), "×")])
+                rows.append([f"{figure}, over its default", contestant, cell(ratios(given, by_itself), "×")])
             elif figure.endswith(ONE_DEVICE):
                 rows.append(
                     [
-                        f"{strip_device_suffix(figure)}, its own choice over one device",
-                        who,
+                        f"{strip_device_suffix(figure)}, its default over one device",
+                        contestant,
                         cell(ratios(by_itself, given), "×"),
                     ]
                 )
     acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
-    for who in dict.fromkeys(who for values in acting for who in values):
-        each = [values[who] for values in acting if who in values]
+    for contestant in dict.fromkeys(contestant for values in acting for contestant in values):
+        each = [values[contestant] for values in acting if contestant in values]
         seeds = set.intersection(*(set(rates) for rates in each))
-        most, least = ({s: f(rates[s] for rates in each) for s in sorted(seeds)} for f in (max, min))
-        label = f"acting, a step's cost at the dearest of {len(each)} numbers of lanes over the cheapest"
-        rows.append([label, who, cell(ratios(most, least), "×")])
+        high, low = ({s: f(rates[s] for rates in each) for s in sorted(seeds)} for f in (max, min))
+        label = f"acting, a step's highest cost over its lowest, of {len(each)} numbers of lanes"
+        rows.append([label, contestant, cell(ratios(high, low), "×")])
     return table(["", "", "ratio"], rows) if rows else ""
 
 
@@ -190,17 +197,23 @@ def page(runs: list[Run], absent: dict[str, str], machine: dict[str, Any]) -> st
     if len(commits := sorted({run["commit"] for run in runs if "commit" in run})) > 1:
         parts.append(f"**Runs of several commits**: {', '.join(commits)}. `--fresh` repeats all.")
     parts.append(
-        "Median [least … greatest] over seeds. A ratio is formed of runs made one after the other, seed by seed, and"
-        " then spread likewise. *not*: most runs did not solve it within their budget."
+        "Median [min … max] over seeds. A ratio is of runs of one seed, made one after the other; its median and range"
+        " are over seeds too. *not*: most runs did not solve it within their budget."
         " Clocks: experiments/baselines/judge.py."
     )
     parts.append(TUNED)
     for group, title in GROUPS.items():
-        mine = [run for run in runs if run["group"] == group]
-        if mine:
-            made = race(mine, group) if group in BARS else commands(mine) if group == "commands" else speed(mine)
+        selected = [run for run in runs if run["group"] == group]
+        if selected:
+            made = (
+                race(selected, group)
+                if group in BARS
+                else commands(selected)
+                if group == "commands"
+                else speed(selected)
+            )
             parts += [f"## {title}", made]
-            if group == "speed" and (more := derived(mine)):
+            if group == "speed" and (more := derived(selected)):
                 parts.append(more)
     broken = [run for run in runs if run["outcome"] not in ("done", "out of time")]
     if absent or broken:

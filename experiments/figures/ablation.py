@@ -27,22 +27,22 @@ TASKS = ("pendulum", "hover")
 # What each row is. A grid's objective that is not here is an error.
 ROWS = {
     "ours": "the paper's choice: condition 4, (π/μ − 1)·A^π ≥ ε|A^π|, A^π by V-trace, replayed trajectories",
-    "condition 3": "(π − μ)·A^π in the ratio's place; ε|A| is then a margin of densities, not of ratios",
-    "condition 2, V-trace off": "(π/μ − 1)·A^μ: returns of replayed trajectories taken as they are (GAE with λ = 1),"
-    " for the policy's update and the critic's, as if they were the present policy's; so this is V-trace off, too",
+    "condition 3": "(π − μ)·A^π in place of the ratio; ε|A| is then a margin of densities, not of ratios",
+    "condition 2, V-trace off": "(π/μ − 1)·A^μ: uncorrected returns of replayed trajectories (GAE with λ = 1) in the"
+    " updates of policy and critic, as if they were the current policy's; so this is V-trace off, too",
     "condition 1": "(π − μ)·A^μ, from the same uncorrected returns",
-    "constant margin": "ξ in the place of ε|A|, with ξ = ε: A has a root mean square of 1",
+    "constant margin": "ξ in place of ε|A|, with ξ = ε: A has a root mean square of 1",
     "PPO": "whole passes over the last unroll, advantages fixed at their start, GAE(0.95), no symmetries",
-    "V-trace's clips off": "importance ratios as they are, ρ̄ and c̄ = 10⁶",
-    "no symmetries": "ours, without turned and mirrored trajectories (not of the paper)",
+    "V-trace's clips off": "importance ratios without clipping, ρ̄ and c̄ = 10⁶",
+    "no symmetries": "ours, without the augmentation by symmetries (which the paper does not have)",
 }
 
 
 class Row(NamedTuple):
-    """One objective on one task: the last report of each seed; a seed that diverged is −∞, or 0 of success."""
+    """One objective on one task: the last report of each seed; one that diverged has return −∞ and success 0."""
 
     returns: np.ndarray  # [seeds]
-    success: np.ndarray  # [seeds], a share
+    success: np.ndarray  # [seeds], a fraction
     diverged: int
 
 
@@ -92,10 +92,12 @@ def rows(out: Path) -> dict[str, Row]:
         lines = list(csv.DictReader(file))
     found = {}
     for name in dict.fromkeys(line["objective"] for line in lines):
-        mine = [line for line in lines if line["objective"] == name]
-        diverged = [bool(line["diverged"]) for line in mine]
-        returns = [-np.inf if bad else float(line["return_mean"]) for bad, line in zip(diverged, mine, strict=True)]
-        success = [0.0 if bad else float(line["success"] or "nan") for bad, line in zip(diverged, mine, strict=True)]
+        selected = [line for line in lines if line["objective"] == name]
+        diverged = [bool(line["diverged"]) for line in selected]
+        returns = [-np.inf if bad else float(line["return_mean"]) for bad, line in zip(diverged, selected, strict=True)]
+        success = [
+            0.0 if bad else float(line["success"] or "nan") for bad, line in zip(diverged, selected, strict=True)
+        ]
         found[name] = Row(np.array(returns), np.array(success), sum(diverged))
     return found
 
@@ -115,7 +117,7 @@ def page(found: dict[str, dict[str, Row]]) -> str:
             " evaluated from the starts of a run's reports after the last step."
         )
     versions = ", ".join(f"{name} {version}" for name, version in record.versions().items())
-    return "\n".join([*lines, "", f"Median [least … most] over seeds. Versions: {versions}.", ""])
+    return "\n".join([*lines, "", f"Median [min … max] over seeds. Versions: {versions}.", ""])
 
 
 def cells_of(row: Row | None) -> tuple[str, str]:
@@ -126,7 +128,7 @@ def cells_of(row: Row | None) -> tuple[str, str]:
 
 
 def spread(values: Any, form: str = ".1f") -> str:
-    """Median [least … most]; a dash where nothing was measured."""
+    """Median [min … max]; a dash where nothing was measured."""
     if np.isnan(values).any():
         return "–"
     return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"

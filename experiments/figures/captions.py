@@ -18,12 +18,12 @@ from qrl_envs.perturbations import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
 from qrl_envs.task import CircleReward
 
 CONFIRMED, EXCEEDED, NOT = "confirmed", "exceeded", "not confirmed"
-SOLVED = 0.99  # share of a report's starts from which a policy flies
+SOLVED = 0.99  # success of a report at which a task counts as solved
 PAPER_HOVER_STEPS = 10e6
 PAPER_CIRCLE_EPISODES = 1.0e6
 PAPER_EPISODE_STEPS = 200
-IDLE = 0.2  # of the greatest gain: a pendulum that gains less has hardly learnt
-HARMONIC = 0.05  # by how much of the wanted speed amplitudes may err, and what else there is
+IDLE = 0.2  # fraction of the largest gain, below which a run has hardly learned
+HARMONIC = 0.05  # tolerance of amplitudes and residual, as a fraction of the reference speed
 
 
 class Caption(NamedTuple):
@@ -36,7 +36,7 @@ class Caption(NamedTuple):
 
 
 class Provenance(NamedTuple):
-    """What a caption says of how its figure was provenance."""
+    """How a figure was made."""
 
     command: str
     commit: str  # of the code that drew it
@@ -113,20 +113,20 @@ def pendulum(rates: list[Rate]) -> Caption:
         said = "ours, every seed" if all_better else "ours, by the median" if better else "not ours"
         lines.append(f"| {rate.title} | {format_quartiles(ours)} | {format_quartiles(ppo)} | {said} |")
     if idle:
-        lines += ["", f"Within these steps hardly anything is learnt by either at: {'; '.join(idle)}."]
+        lines += ["", f"Within these steps hardly anything is learned by either at: {'; '.join(idle)}."]
     high, low = PAPER_RATES["high"], PAPER_RATES["low"]
     first = rates[0].ours
     return Caption(
         "Pendulum: learning curves at two learning rates, against PPO",
         f"Return of 200 steps over environment steps: median and interquartile range of {first.seeds} seeds,"
         f" {thousands(first.steps[-1])} steps each. Ours is the paper's method, on- and off-policy, on trajectories"
-        " turned by the task's symmetries; PPO the same learner with a ring of one unroll and GAE(0.95)."
-        f" The paper's learning rates are {high:g} and {low:g}, held constant here; this recipe's are what its preset"
-        f" says (with its schedule), and the same divided by {high / low:g}, the ratio between the paper's two.",
+        " augmented by the task's symmetries; PPO is the same learner with a replay buffer of one unroll and GAE(0.95)."
+        f" The paper's learning rates are {high:g} and {low:g}, held constant here; this recipe's are its preset's"
+        f" (with its schedule), and the same divided by {high / low:g}, the ratio of the paper's two.",
         "At both of its learning rates the combined method does slightly better than a minimally tuned PPO.",
         lines,
         f"Over the {len(verdicts)} of {len(rates)} rates at which one of the two learns (gains {IDLE:.0%} or more of"
-        " the greatest gain): confirmed, if at each of them our median return at the end is above PPO's; exceeded, if"
+        " the largest gain): confirmed, if at each of them our median return at the end is above PPO's; exceeded, if"
         " at each our worst seed is above PPO's best.",
         NOT if NOT in verdicts else CONFIRMED if CONFIRMED in verdicts else EXCEEDED,
     )
@@ -144,7 +144,7 @@ def hover(curves: Curves) -> Caption:
     reference = ", ".join(f"{value:g} at {thousands(steps)}" for steps, value in PUBLISHED)
     return Caption(
         "Hover: learning curves",
-        f"Return of 200 steps and share of successful flights over environment steps: median and interquartile range"
+        f"Return of 200 steps and success over environment steps: median and interquartile range"
         f" of {curves.seeds} seeds. For reference the authors' published checkpoints, flown in the same way"
         f" ({reference}).",
         f"{thousands(PAPER_HOVER_STEPS)} time steps are enough for a policy that hovers steadily (two runs).",
@@ -162,7 +162,7 @@ def hover(curves: Curves) -> Caption:
 
 
 def circle(curves: Curves, episode_steps: int) -> Caption:
-    """`episode_steps`: the longest of this run; ours are counted as if they were of the paper's length."""
+    """`episode_steps`: this run's maximum; steps are converted to episodes of the paper's length."""
     solved = solved_at(curves)
     episodes = solved / PAPER_EPISODE_STEPS
     verdict = (
@@ -174,10 +174,10 @@ def circle(curves: Curves, episode_steps: int) -> Caption:
     )
     return Caption(
         "Circle: learning curves",
-        f"Return of 200 steps and share of successful flights over environment steps: median and interquartile range"
-        f" of {curves.seeds} seeds. The weights of the reward are ours (the paper gives none), and so returns cannot be"
-        f" held against the paper's.",
-        f"The controller has learnt to fly the circle after around {PAPER_CIRCLE_EPISODES / 1e6:.1f} million training"
+        f"Return of 200 steps and success over environment steps: median and interquartile range"
+        f" of {curves.seeds} seeds. The weights of the reward are ours (the paper gives none), so returns cannot be"
+        f" compared with the paper's.",
+        f"The controller has learned to fly the circle after around {PAPER_CIRCLE_EPISODES / 1e6:.1f} million training"
         f" episodes, of at most {PAPER_EPISODE_STEPS} steps (two runs).",
         [
             *_solved_lines(curves, solved),
@@ -195,8 +195,8 @@ def circle(curves: Curves, episode_steps: int) -> Caption:
 
 
 def solved_at(curves: Curves) -> np.ndarray:
-    """Environment steps at each seed's report from which on success is SOLVED or more to the end, [seeds]; infinite
-    where the last report's is not."""
+    """Environment steps at the first report of each seed from which success stays at SOLVED or more, [seeds]; infinite
+    where there is none."""
     held = np.logical_and.accumulate((curves.success >= SOLVED)[:, ::-1], axis=1)[:, ::-1]
     return np.where(held.any(axis=1), curves.steps[np.argmax(held, axis=1)], np.inf)
 
@@ -204,13 +204,13 @@ def solved_at(curves: Curves) -> np.ndarray:
 def _solved_lines(curves: Curves, solved: np.ndarray) -> list[str]:
     count = int(np.isfinite(solved).sum())
     return [
-        f"- {count} of {curves.seeds} seeds come to a success of {SOLVED:.0%} or more and keep it in every later"
+        f"- {count} of {curves.seeds} seeds reach a success of {SOLVED:.0%} or more and keep it in every later"
         f" report, after {_counts(solved)} steps."
     ]
 
 
 def _counts(values: np.ndarray) -> str:
-    """Median and range over seeds of steps or episodes; a seed that never came there ranks last."""
+    """Median and range over seeds of steps or episodes; a seed that never reaches it ranks last."""
     low, median, high = np.sort(values)[[0, (len(values) - 1) // 2, -1]]
     names = [f"{value:,.0f}" if np.isfinite(value) else "never" for value in (median, low, high)]
     return f"{names[0]} [{names[1]} … {names[2]}] (median, range)"
@@ -235,7 +235,7 @@ def trial(flown: PolicyFlights) -> Caption:
             f" RMS distance in the last {flown.task.evaluation.tail_s:g} s:"
             f" {_mm(flown.measures['rms_position_m'][0])}.",
             f"- From {len(settle):,} attitudes and body rates: success {share:.1%}; the median"
-            f" flight {_settles(_rank(settle, 0.5))}, the one 95 % up the ranks {_settles(_rank(settle, 0.95))}.",
+            f" flight {_settles(_rank(settle, 0.5))}, the 95th percentile {_settles(_rank(settle, 0.95))}.",
         ],
         f"Confirmed: the flight drawn thick succeeds (within {flown.task.evaluation.distance_m:g} m throughout the last"
         f" {flown.task.evaluation.tail_s:g} s); exceeded: so do {SOLVED:.0%} or more of all attitudes.",
@@ -247,13 +247,13 @@ def from_above(flown: PolicyFlights, shown: int) -> Caption:
     success = flown.measures["success"]
     rms = flown.measures["rms_radius_m"][:shown]
     count = int(success[:shown].sum())
-    wanted = _wanted(flown)
+    target = _target(flown)
     return Caption(
         "Circle: five flights from above",
         f"Paths on the x-y plane of the first {shown} starts of `make evaluate`, {flown.times_s[-1]:g} s each,"
-        f" deterministic policy of seed {flown.seed} after {flown.env_steps:,} steps; dashed the {wanted.radius_m:g} m"
+        f" deterministic policy of seed {flown.seed} after {flown.env_steps:,} steps; dashed the {target.radius_m:g} m"
         " reference.",
-        f"From five different initial states the vehicle comes onto the {wanted.radius_m:g} m circle and follows it.",
+        f"From five different initial states the vehicle comes onto the {target.radius_m:g} m circle and follows it.",
         [
             f"- {count} of the {shown} succeed, with RMS radius errors in the last {flown.task.evaluation.tail_s:g} s"
             f" of {', '.join(map(_mm, rms))}.",
@@ -262,7 +262,7 @@ def from_above(flown: PolicyFlights, shown: int) -> Caption:
             f" {_mm(np.median(flown.measures['rms_height_m']))}.",
         ],
         f"Confirmed: all {shown} flights succeed (within {flown.task.evaluation.distance_m:g} m of the circle and"
-        f" {flown.task.evaluation.speed_m_s:g} m/s of {wanted.speed_m_s:g} m/s throughout the last"
+        f" {flown.task.evaluation.speed_m_s:g} m/s of {target.speed_m_s:g} m/s throughout the last"
         f" {flown.task.evaluation.tail_s:g} s); exceeded: so do {SOLVED:.0%} or more of all starts.",
         NOT if count < shown else EXCEEDED if success.mean() >= SOLVED else CONFIRMED,
     )
@@ -270,27 +270,27 @@ def from_above(flown: PolicyFlights, shown: int) -> Caption:
 
 def velocity(flown: PolicyFlights) -> Caption:
     amplitudes, rest, frequency = harmonic(flown)
-    wanted = _wanted(flown)
+    target = _target(flown)
     tail = flown.observations[0, -_tail(flown) :, 12:14]
-    off = max(*np.abs(amplitudes - wanted.speed_m_s), rest) / wanted.speed_m_s
+    off = max(*np.abs(amplitudes - target.speed_m_s), rest) / target.speed_m_s
     return Caption(
         "Circle: velocity along x and y",
-        f"vx and vy over time of the first flight of the figure from above; dotted ±{wanted.speed_m_s:g} m/s.",
-        f"The velocities along x and y are simple harmonic motions with a maximum speed of {wanted.speed_m_s:g} m/s.",
+        f"vx and vy over time of the first flight of the figure from above; dotted ±{target.speed_m_s:g} m/s.",
+        f"The velocities along x and y are simple harmonic motions with a maximum speed of {target.speed_m_s:g} m/s.",
         [
             f"- Sinusoids of one frequency fitted to the last {flown.task.evaluation.tail_s:g} s: amplitudes"
             f" {amplitudes[0]:.3f} m/s (vx) and {amplitudes[1]:.3f} m/s (vy) at {frequency:.3f} rad/s"
-            f" ({wanted.speed_m_s / wanted.radius_m:g} rad/s would be exact); what they leave: {rest:.3f} m/s RMS.",
+            f" ({target.speed_m_s / target.radius_m:g} rad/s would be exact); residual: {rest:.3f} m/s RMS.",
             f"- Greatest |vx| and |vy| there: {np.abs(tail[:, 0]).max():.3f} and {np.abs(tail[:, 1]).max():.3f} m/s.",
         ],
-        f"Confirmed: both amplitudes and the remainder are within {HARMONIC:.0%} of {wanted.speed_m_s:g} m/s.",
+        f"Confirmed: both amplitudes' errors and the residual are within {HARMONIC:.0%} of {target.speed_m_s:g} m/s.",
         CONFIRMED if off <= HARMONIC else NOT,
     )
 
 
 def harmonic(flown: PolicyFlights) -> tuple[np.ndarray, float, float]:
-    """Amplitudes [2] [m/s] of the sinusoids fitted to vx and vy over the first flight's tail, the RMS [m/s] of what
-    they leave, and their angular frequency [rad/s], at which the velocity turns there on average."""
+    """Amplitudes [2] [m/s] of the sinusoids fitted to vx and vy over the first flight's tail, the RMS [m/s] of the
+    residual, and their angular frequency [rad/s], the mean rate at which the velocity's direction rotates there."""
     n = _tail(flown)
     t, v = flown.times_s[-n:], flown.observations[0, -n:, 12:14].astype(float)
     if not np.isfinite(v).all():
@@ -305,14 +305,14 @@ def _tail(flown: PolicyFlights) -> int:
     return round(flown.task.evaluation.tail_s / flown.task.control_period_s) + 1
 
 
-def _wanted(flown: PolicyFlights) -> CircleReward:
-    wanted = flown.task.evaluation.reward
-    assert isinstance(wanted, CircleReward)
-    return wanted
+def _target(flown: PolicyFlights) -> CircleReward:
+    reward = flown.task.evaluation.reward
+    assert isinstance(reward, CircleReward)
+    return reward
 
 
 def _rank(values: np.ndarray, share: float) -> float:
-    """The value so far up the ranks: itself infinite where too few are finite."""
+    """The quantile `share` without interpolation; infinite where too few are finite."""
     return float(np.sort(values)[round(share * (len(values) - 1))])
 
 
@@ -320,5 +320,5 @@ def _settles(seconds: float) -> str:
     return f"settles after {seconds:.2f} s" if np.isfinite(seconds) else "never settles"
 
 
-def _mm(metres: float) -> str:
-    return f"{1000.0 * metres:.1f} mm" if np.isfinite(metres) else "no number (it ended early)"
+def _mm(meters: float) -> str:
+    return f"{1000.0 * meters:.1f} mm" if np.isfinite(meters) else "not finite (it ended early)"

@@ -31,7 +31,7 @@ from qrl.cli.terminal import DONE, FAILED
 from qrl.runs import files, record
 from qrl_envs.specfile import BadInput, nearest
 
-FIGURES = {  # name -> the beginnings of the names of its runs; the first that exists
+FIGURES = {  # name -> name of its run, or prefix of the names of its runs; the first that exists
     "pendulum": ("pendulum-",),
     "hover": ("hover",),
     "hover_trial": ("hover-flight", "hover"),
@@ -73,7 +73,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: bool) -> dict[str, Caption]:
-    """Each figure as soon as its runs are there; their captions."""
+    """Draw each figure as soon as its runs are finished; their captions."""
     start = time.perf_counter()
     plan, there, found = planned(fast=fast), set[str](), dict[str, Caption]()
     fly = functools.cache(fly_policy)
@@ -97,9 +97,9 @@ def figures(names: list[str], out: Path, command: str, *, fast: bool, fresh: boo
 
 def needed(name: str, plan: list[RunSpec]) -> list[RunSpec]:
     """The runs of `plan` that the figure `name` is drawn from."""
-    for beginning in FIGURES[name]:
-        many = beginning.endswith("-")
-        if found := [one for one in plan if one.name == beginning or (many and one.name.startswith(beginning))]:
+    for prefix in FIGURES[name]:
+        many = prefix.endswith("-")
+        if found := [one for one in plan if one.name == prefix or (many and one.name.startswith(prefix))]:
             return found
     raise AssertionError(name)
 
@@ -148,14 +148,14 @@ def rates(sources: list[Source]) -> list[Rate]:
     """Both methods' curves at each rate, the paper's first."""
     by_name = {source.run.name: source for source in sources}
     found = []
-    for whose, before in (("the paper's learning rates", "paper-"), ("this recipe's learning rates", "")):
+    for source, infix in (("the paper's learning rates", "paper-"), ("this recipe's learning rates", "")):
         for which in PAPER_RATES:
-            name = f"pendulum-{before}{which}"
+            name = f"pendulum-{infix}{which}"
             if name in by_name:
                 rate = by_name[name].run.flags["learning_rate"]
                 ours = curves(by_name[name], f"ours, {rate:g}")
                 ppo = curves(by_name[f"{name}-ppo"], f"PPO, {rate:g}")
-                found.append(Rate(f"{whose}: {which}, {rate:g}", ours, ppo))
+                found.append(Rate(f"{source}: {which}, {rate:g}", ours, ppo))
     return found
 
 

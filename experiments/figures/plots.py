@@ -1,4 +1,4 @@
-"""The paper's six figures, for one column of a page; of matplotlib's objects alone, without pyplot."""
+"""The paper's six figures, of one column's width; matplotlib objects, without pyplot."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +20,7 @@ from qrl_envs.task import CircleReward
 
 WIDTH_IN = 3.4  # a column
 PIXELS_PER_INCH = 200
-POINTS = 8.0  # the least size of a letter
+POINTS = 8.0  # font size
 DASHES = ("-", (0, (4, 1.5)), (0, (1, 1.2)))  # lines differ in dash as well as color
 PUBLISHED = ((2e6, 151.0), (3e6, 158.0), (5e6, 160.6), (10e6, 162.9))  # authors' checkpoints, flown: steps, return
 SHOWN = 5
@@ -53,7 +53,7 @@ class Curves(NamedTuple):
     label: str
     steps: np.ndarray  # [x]
     returns: np.ndarray  # [seeds, x]
-    success: np.ndarray  # [seeds, x], a share; NaN where it is not measured
+    success: np.ndarray  # [seeds, x], a fraction; NaN where it is not measured
 
     @property
     def seeds(self) -> int:
@@ -189,7 +189,7 @@ def trial(flown: PolicyFlights) -> Figure:
             for other in others:
                 axes.plot(flown.times_s, other, color=COLORS[i], linewidth=0.7, alpha=0.35)
             axes.plot(flown.times_s, first, color=COLORS[i], linestyle=dash, label=name, zorder=3)
-        # All of the thick lines, beneath the legend; a diverging flight leaves the window.
+        # The window has all of the thick lines, below the legend; a diverging flight leaves it.
         drawn = flown.observations[0, :, 9:12]
         low, high = np.nanmin(drawn), np.nanmax(drawn)
         limits = low - 0.2 * (high - low), high + 0.3 * (high - low)
@@ -202,7 +202,7 @@ def from_above(flown: PolicyFlights) -> Figure:
     """Paths of the first five flights on the x-y plane, and the reference circle."""
     with style():
         figure, (axes,) = _figure(3.5)
-        angle, r = np.linspace(0.0, 2.0 * np.pi, 181), _wanted(flown).radius_m
+        angle, r = np.linspace(0.0, 2.0 * np.pi, 181), _target(flown).radius_m
         x, y = r * np.cos(angle), r * np.sin(angle)
         for color, path in zip(COLORS, flown.observations[:SHOWN, :, 9:11], strict=False):
             axes.plot(*path.T, color=color, linewidth=1.0)
@@ -220,18 +220,18 @@ def velocity(flown: PolicyFlights) -> Figure:
     """vx and vy of the first flight over time, and ± the reference speed."""
     with style():
         figure, (axes,) = _figure(2.3)
-        wanted = _wanted(flown).speed_m_s
+        reference = _target(flown).speed_m_s
         for i, (name, dash) in enumerate(zip(("vx", "vy"), DASHES, strict=False)):
             values = flown.observations[0, :, 12 + i]
             axes.plot(flown.times_s, values, color=COLORS[i], linestyle=dash, label=name)
-        for k, level in enumerate((wanted, -wanted)):
-            axes.axhline(level, color="black", linestyle=":", linewidth=1.0, label="" if k else f"±{wanted:g} m/s")
+        for k, level in enumerate((reference, -reference)):
+            axes.axhline(level, color="black", linestyle=":", linewidth=1.0, label="" if k else f"±{reference:g} m/s")
         axes.set(xlabel="time [s]", ylabel="velocity [m/s]", xlim=(0.0, flown.times_s[-1]))
         figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         return figure
 
 
-def _wanted(flown: PolicyFlights) -> CircleReward:
-    wanted = flown.task.evaluation.reward
-    assert isinstance(wanted, CircleReward)
-    return wanted
+def _target(flown: PolicyFlights) -> CircleReward:
+    reward = flown.task.evaluation.reward
+    assert isinstance(reward, CircleReward)
+    return reward

@@ -1,4 +1,4 @@
-"""The runs that the figures are drawn from: which there are, whether they are current, and how one is made."""
+"""The runs behind the figures: which there are, whether they are current, and how they are trained."""
 
 import ast
 import hashlib
@@ -19,38 +19,45 @@ from qrl.runs.record import ConfigFile, RunConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 ROOMS = {"qrl": ROOT / "src" / "qrl", "qrl_envs": ROOT / "envs" / "qrl_envs"}
-TRAINING = ("qrl.training.driver", "qrl_envs.env")  # what they import, and they, decide a run's numbers
-CODE = "code.sha256"  # in a run's folder: of which code it is
+TRAINING = ("qrl.training.driver", "qrl_envs.env")  # with all that they import: the code that decides a run's numbers
+CODE = "code.sha256"  # in a run's folder: the hash of the code that trained it
 
 SEEDS, FAST_SEEDS = 6, 2  # even, so that two cores share them
 # Schulman et al. 2017: eight whole passes over the last unroll of 16 lanes, the ratio clipped at 0.2, GAE(0.95). What
 # differs: no entropy bonus, and the step size and sigma of the method that it stands beside.
 PPO = {
-    "replay_unrolls": 1, "warmup_unrolls": 1, "sampling": "epochs", "symmetries": False, "advantage": "mu",
-    "lam": 0.95, "epsilon": 0.2, "updates_per_unroll": 16, "batch_size": 8,
+    "replay_unrolls": 1,
+    "warmup_unrolls": 1,
+    "sampling": "epochs",
+    "symmetries": False,
+    "advantage": "mu",
+    "lam": 0.95,
+    "epsilon": 0.2,
+    "updates_per_unroll": 16,
+    "batch_size": 8,
 }
 PAPER_RATES = {"high": 1e-4, "low": 0.5e-5}
-METHOD = {"apg_fraction": 0.0}  # the paper's method to the end, on trajectories that symmetries turn
+NO_APG = {"apg_fraction": 0.0}  # the paper's learner, with symmetries
 RATIO = PAPER_RATES["high"] / PAPER_RATES["low"]
 
 
 class Failed(RuntimeError):
-    """A run ended with an error; the message says which, in a line."""
+    """A run ended with an error; the message is one line."""
 
 
 class RunSpec(NamedTuple):
-    """A run that a figure needs; its folder is named so."""
+    """A run that a figure needs."""
 
-    name: str
+    name: str  # of its folder, too
     task: str
-    preset: str  # whose values the flags are laid over
+    preset: str  # whose values the flags override
     flags: dict[str, Any]  # of `qrl train`, by the names of qrl.config
     seeds: int = 1
     seed: int = 0
 
     @property
     def words(self) -> list[str]:
-        """The command, but for its --out."""
+        """The command, without its --out."""
         preset = [] if self.preset == self.task else ["--preset", self.preset]
         flags = [
             w
@@ -61,26 +68,26 @@ class RunSpec(NamedTuple):
         return ["train", self.task, *seed, "--seeds", str(self.seeds), *preset, *flags]
 
     def config(self) -> RunConfig:
-        """What its config.json says if it is made now."""
+        """The config.json of this run if it were trained now."""
         return request.run_config(self.task, None, ConfigFile(), self.flags, self.seed, self.seeds, preset=self.preset)
 
 
 def plan(*, fast: bool) -> list[RunSpec]:
-    """All runs, the quickest tasks first."""
+    """All runs, the fastest tasks first."""
     seeds = FAST_SEEDS if fast else SEEDS
     found = pendulums("pendulum_fast" if fast else "pendulum", seeds, paper=not fast)
     if fast:
         return [
             *found,
-            RunSpec("hover", "hover", "hover_fast", METHOD, seeds),
-            RunSpec("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 1_200_000}, seeds),
+            RunSpec("hover", "hover", "hover_fast", NO_APG, seeds),
+            RunSpec("circle", "circle", "circle_fast", NO_APG | {"num_timesteps": 1_200_000}, seeds),
         ]
     return [
         *found,
-        RunSpec("hover", "hover", "hover", METHOD | {"num_timesteps": 1_500_000, "num_evals": 25}, seeds),
-        RunSpec("circle", "circle", "circle_fast", METHOD | {"num_timesteps": 2_400_000, "num_evals": 20}, seeds),
-        RunSpec("hover-flight", "hover", "hover", METHOD | {"num_timesteps": 4_500_000}),
-        RunSpec("circle-flight", "circle", "circle", METHOD | {"num_timesteps": 4_500_000}),
+        RunSpec("hover", "hover", "hover", NO_APG | {"num_timesteps": 1_500_000, "num_evals": 25}, seeds),
+        RunSpec("circle", "circle", "circle_fast", NO_APG | {"num_timesteps": 2_400_000, "num_evals": 20}, seeds),
+        RunSpec("hover-flight", "hover", "hover", NO_APG | {"num_timesteps": 4_500_000}),
+        RunSpec("circle-flight", "circle", "circle", NO_APG | {"num_timesteps": 4_500_000}),
     ]
 
 
@@ -99,16 +106,16 @@ def pendulums(preset: str, seeds: int, *, paper: bool) -> list[RunSpec]:
     ]
 
 
-# Whether a run is there
+# Whether a run is current
 
 
 def is_current(folder: Path, run: RunConfig) -> bool:
-    """Whether this very run is there, finished, made by the code and with the versions that are here now."""
+    """Whether `folder` holds this run, finished, trained by the present code and versions."""
     return (folder / "summary.json").exists() and is_same(folder, run)
 
 
 def is_same(folder: Path, run: RunConfig) -> bool:
-    """Whether `folder` holds this very run, finished or not. On which devices and at which commit is no matter."""
+    """Whether `folder` holds this run, finished or not. Devices and commit may differ."""
     try:
         stored = json.loads((folder / "config.json").read_text())
         code = (folder / CODE).read_text()
@@ -118,13 +125,13 @@ def is_same(folder: Path, run: RunConfig) -> bool:
 
 
 def deciding(config: dict[str, Any]) -> dict[str, Any]:
-    """What of a config.json decides a run's numbers."""
+    """The part of a config.json that decides a run's numbers."""
     versions = {name: version for name, version in config.get("versions", {}).items() if name not in ("commit", "qrl")}
     return {name: config.get(name) for name in ("task", "learner", "seed", "seeds")} | {"versions": versions}
 
 
 def sha256() -> str:
-    """Of all sources that decide what a run's numbers are. A plot may change, and the runs stay."""
+    """The hash of all sources that decide a run's numbers; a plot's code may change without making runs stale."""
     found = hashlib.sha256()
     for name, path in sorted(sources().items()):
         found.update(f"{name}\0".encode() + path.read_bytes() + b"\0")
@@ -132,15 +139,15 @@ def sha256() -> str:
 
 
 def sources() -> dict[str, Path]:
-    """Module -> file of TRAINING and whatever of our two packages they import."""
+    """Module -> file of TRAINING and all that they import of our two packages."""
     found: dict[str, Path] = {}
-    ahead = list(TRAINING)
-    while ahead:
-        name = ahead.pop()
+    pending = list(TRAINING)
+    while pending:
+        name = pending.pop()
         path = _file(name)
         if path and name not in found:
             found[name] = path
-            ahead += _imports(path)
+            pending += _imports(path)
     return found
 
 
@@ -160,13 +167,13 @@ def _imports(path: Path) -> list[str]:
     return names
 
 
-# How a run is made
+# Train
 
 
 def train(one: RunSpec, folder: Path, env: dict[str, str] | None = None) -> float:
-    """Make the run as a user would, in a process of its own; an unfinished one of the same is gone on with.
+    """Train the run with `qrl train`, in a process of its own, or resume it if it is unfinished; returns the seconds.
 
-    Returns its seconds; raises Failed. What else the folder held is removed.
+    Another run in the folder is removed. Raises Failed.
     """
     words = [*one.words, "--out", str(folder)]
     if is_same(folder, one.config()):
@@ -175,20 +182,20 @@ def train(one: RunSpec, folder: Path, env: dict[str, str] | None = None) -> floa
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         (folder / CODE).write_text(sha256())
-    begun = time.perf_counter()
+    start = time.perf_counter()
     qrl(words, env)
-    return time.perf_counter() - begun
+    return time.perf_counter() - start
 
 
 def qrl(words: list[str], env: dict[str, str] | None = None) -> None:
     """The command line in a process of its own, with `env` added to its environment; Failed if it fails."""
     command = [sys.executable, "-m", "qrl", *words]
-    # In a session of its own, so that Ctrl-C reaches it once: through us.
+    # In a session of its own, so that Ctrl-C reaches it only once, by `terminate`.
     with subprocess.Popen(command, env=environment() | (env or {}), start_new_session=True) as process:
         try:
             code = process.wait()
         except BaseException:
-            process.terminate()  # it saves, and then ends
+            process.terminate()  # it saves and exits
             process.wait()
             raise
     if code:
@@ -196,12 +203,12 @@ def qrl(words: list[str], env: dict[str, str] | None = None) -> None:
 
 
 def environment() -> dict[str, str]:
-    """Of a run's process: this code's own packages, whatever is installed."""
+    """The environment of a run's process, in which this checkout's packages take precedence."""
     paths = os.pathsep.join([str(ROOT / "src"), str(ROOT / "envs"), *filter(None, [os.environ.get("PYTHONPATH")])])
     return {**os.environ, "PYTHONPATH": paths}
 
 
-# What a run says
+# Read
 
 
 def rows(folder: Path) -> list[Rows]:

@@ -1,1 +1,1 @@
-"""The page of figures, flights and tables, and the browser that pictures it."""
+"""The page of figures, flights and tables, and the browser that takes its pictures."""

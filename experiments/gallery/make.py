@@ -3,8 +3,8 @@
     .venv/bin/python -m experiments.gallery.make [--out docs] [--runs experiments/out] [--fast] [--fresh]
 
 The paper's figures (as `make figures` makes them), the policies of the presets that ship (trained, flown by `qrl
-evaluate` beside controllers and PPO, and shown by `qrl view`), and the pages of
-`make ablation` and `make bench` where they exist. Runs of the same code are kept. The viewer's picture needs Chromium
+evaluate` beside controllers and PPO, and shown by `qrl view`), and the pages of `make ablation` and `make bench` where
+they exist. Runs of the same code are kept. The viewer's picture needs Chromium
 and its driver; without them the old one stays.
 """
 
@@ -82,12 +82,12 @@ def evaluate_preset(task: str, folder: Path, *, fresh: bool) -> PresetResult:
     ours, ppo = RunSpec(task, task, task, {}), RunSpec(f"{task}-ppo", task, f"{task}_ppo", {})
     for one in (ours, ppo):
         ensure_run(one, folder / one.name, fresh=fresh)
-    mine = folder / ours.name
+    run = folder / ours.name
     off = ["--off-nominal"] if task != "pendulum" else []
-    figure_runs.qrl(["evaluate", str(mine), *off, "--beside", str(folder / ppo.name)])
+    figure_runs.qrl(["evaluate", str(run), *off, "--beside", str(folder / ppo.name)])
     if task == VIEWED:
-        figure_runs.qrl(["view", str(mine)])
-    return PresetResult(ours, ppo, mine, json.loads((mine / "evaluation.json").read_text(encoding="utf-8")))
+        figure_runs.qrl(["view", str(run)])
+    return PresetResult(ours, ppo, run, json.loads((run / "evaluation.json").read_text(encoding="utf-8")))
 
 
 def ensure_run(one: RunSpec, folder: Path, *, fresh: bool) -> None:
@@ -115,7 +115,7 @@ def screenshot(html: Path, address: str, target: Path) -> None:
         if not wrong:
             atomic_write(target, lambda temporary: temporary.write_bytes(picture))
     if wrong:
-        print(f"gallery: {target} stays as it is: {wrong}", file=sys.stderr)
+        print(f"gallery: {target} kept: {wrong}", file=sys.stderr)
 
 
 def read_if_exists(path: Path) -> str:

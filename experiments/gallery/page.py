@@ -10,16 +10,16 @@ from experiments.output import table
 
 SHIPPED = ("pendulum", "hover", "circle")
 ERRORS = "Errors over time: median and 5 to 95 % of 1,000 starts, beside the medians of the others."
-SETTLE = "How long flights take to settle, by the tilt and speed that they began with."
+SETTLE = "Settle time by initial tilt and speed."
 PICTURES = {  # of a run -> what each shows
     "pendulum": {"learning_curve": "Return and success of the run's reports.", "evaluation": ERRORS},
     "hover": {"evaluation": ERRORS, "settle": SETTLE},
     "circle": {"flight": "Five flights of the last report.", "evaluation": ERRORS, "settle": SETTLE},
 }
-LEARNT = {
-    "pendulum": "The paper's method to the end.",
-    "hover": "The paper's method, and then the gradient of flights through the simulator.",
-    "circle": "The paper's method, and then the gradient of flights through the simulator.",
+METHOD = {
+    "pendulum": "Without APG (the paper's learner, with symmetries).",
+    "hover": "The paper's learner, with symmetries, then APG.",
+    "circle": "The paper's learner, with symmetries, then APG.",
 }
 ROWS = {  # of evaluation.json -> heading, factor, form
     "return_mean": ("return", 1.0, ".1f"),
@@ -33,7 +33,7 @@ ROWS = {  # of evaluation.json -> heading, factor, form
     "rms_angle_rad": ("angle, rad", 1.0, ".4f"),
 }
 VIEWED = "circle"
-NAMED = 5  # failures by their index
+NAMED = 5  # failures listed by index
 
 
 class PresetResult(NamedTuple):
@@ -72,14 +72,14 @@ def page(
         "",
         table(["figure", "the paper's claim", "here"], claims),
         "",
-        "The figures' policies learn by the paper's method alone, without the analytic gradient that ends the shipped"
-        " presets; but trajectories are augmented by the tasks' symmetries, which the paper does not do.",
+        "The figures' policies are trained without APG (the paper's learner, with symmetries): the shipped presets of"
+        " hover and circle end with APG. The paper does not augment trajectories by symmetries.",
         "",
     ]
     for name, caption in captions.items():
         lines += [f'<a id="{name}"></a>', "", f"### {caption.title}", "", f"![{caption.title}](gallery/{name}.png)", ""]
         lines += [caption.shows, "", *caption.found, "", f"**{caption.verdict.capitalize()}.** {caption.rule}"]
-        lines += [f"([How it was provenance.](gallery/{name}.md))", ""]
+        lines += [f"([How it was made.](gallery/{name}.md))", ""]
     lines += ["## The policies that the presets train", ""]
     for one in results:
         lines += policy(one, provenance.pictures)
@@ -96,7 +96,7 @@ def policy(one: PresetResult, there: set[str]) -> list[str]:
     (ppo,) = found["beside"].values()
     columns = {"policy": found, "PPO": ppo, **found.get("baselines", {})}
     rows = {key: row for key, row in ROWS.items() if key in found}
-    lines = [f"### {one.task.capitalize()}", "", LEARNT[one.task]]
+    lines = [f"### {one.task.capitalize()}", "", METHOD[one.task]]
     lines += [f"`qrl {' '.join(one.ours.words)}`, {found['env_steps']:,} steps; PPO: `qrl {' '.join(one.ppo.words)}`,"]
     lines += [f"{ppo['env_steps']:,} steps. {found['starts']:,} fresh starts, deterministic policies.", ""]
     cells = [

@@ -2,10 +2,10 @@
 
     .venv/bin/python -m experiments.profiling.run [TASK] [--repeats 9]
 
-Each part of one unroll and its updates, with the task's preset, is compiled alone and timed, the parts in turn, medians
-over repeats. A repeat's result is the next one's input, so that XLA removes nothing. Parts of parts are indented. "Of
-the floor" is the time of the part's multiply-adds alone, at the rate of a 64 x 64 product measured at the same time,
-over the part's time.
+Each part of one unroll and its updates, with the task's preset, is compiled and timed by itself, one after the other;
+medians over repeats. A repeat's result is the next one's input, so that XLA removes nothing. Parts of parts are
+indented. "Of the floor" is the time of the part's multiply-adds at the rate of a 64 x 64 product, measured at the same
+time, over the part's time.
 """
 
 import os
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.arguments import Parser
-from experiments.profiling.parts import REPEATED, Now, Part, Turn, now_of, parts
+from experiments.profiling.parts import REPEATS, Call, Inputs, Part, make_inputs, parts
 from qrl import request, tasks
 from qrl.runs import record
 from qrl.training import driver
@@ -52,25 +52,25 @@ def full_program(advance: Callable[..., TrainState], states: TrainState, points:
     return advance_unrolls
 
 
-def repeated(trainer: Trainer, part: Part, now: Now) -> Callable[[], None]:
-    """The part compiled and repeated REPEATED times; each result is the next one's `last`."""
+def repeated(trainer: Trainer, part: Part, inputs: Inputs) -> Callable[[], None]:
+    """The part compiled and repeated REPEATS times; each result is the next one's `last`."""
 
-    def make(now: Now, last: Any, i: chex.Array) -> Any:
-        result = part.make(trainer, Turn(now, last, i, 1e-30 * (i + 1).astype(jnp.float32)))
+    def make(inputs: Inputs, last: Any, i: chex.Array) -> Any:
+        result = part.make(trainer, Call(inputs, last, i, 1e-30 * (i + 1).astype(jnp.float32)))
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), result)  # no weak types
 
-    def repeat(now: Now, last: Any) -> Any:
-        return jax.lax.scan(lambda last, i: (make(now, last, i), None), last, jnp.arange(REPEATED))[0]
+    def repeat(inputs: Inputs, last: Any) -> Any:
+        return jax.lax.scan(lambda last, i: (make(inputs, last, i), None), last, jnp.arange(REPEATS))[0]
 
     first = part.first
     if first is None:
-        shapes = jax.eval_shape(lambda now: make(now, None, jnp.int32(0)), now)
+        shapes = jax.eval_shape(lambda inputs: make(inputs, None, jnp.int32(0)), inputs)
         first = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
     program = jax.jit(repeat, donate_argnums=1, compiler_options=xla_effort(1))
     box = [jax.tree.map(jnp.array, first)]
 
     def timed() -> None:
-        box[0] = jax.block_until_ready(program(now, box[0]))
+        box[0] = jax.block_until_ready(program(inputs, box[0]))
 
     return timed
 
@@ -102,7 +102,7 @@ def measure(
     rates = []
     for _ in range(repeats + 1):  # the first compiles
         for part, call in zip(rows, calls, strict=True):
-            seconds[part.name].append(seconds_of(call) / REPEATED * part.times)
+            seconds[part.name].append(seconds_of(call) / REPEATS * part.times)
         seconds["all"].append(seconds_of(full) / UNROLLS)
         rates.append(product_rate())
     return {name: float(np.median(values[1:])) for name, values in seconds.items()}, float(np.median(rates))
@@ -125,9 +125,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9)
     args = parser.parse_args()
     trainer, points, states, advance = start(args.task)
-    now = now_of(trainer, states, points)
-    rows = parts(trainer, now)
-    calls = [repeated(trainer, part, now) for part in rows]
+    inputs = make_inputs(trainer, states, points)
+    rows = parts(trainer, inputs)
+    calls = [repeated(trainer, part, inputs) for part in rows]
     took, rate = measure(rows, calls, full_program(advance, states, points), args.repeats)
     print(
         f"{jax.devices()[0].device_kind}, jax {jax.__version__}; {2e-9 * rate:.0f} GFLOP/s in [1600, 64] x [64, 64]\n"

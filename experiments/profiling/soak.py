@@ -1,9 +1,9 @@
-"""One long run of hover: memory must not grow, nothing be compiled on the way, the return not collapse.
+"""One long run of hover, without APG: memory must not grow, nothing may compile midway, the return must not collapse.
 
     .venv/bin/python -m experiments.profiling.soak [--steps 2e8] [--hours 1] [--out experiments/out/soak]
 
 Ends at the steps or the hours, whichever comes first, and leaves soak.csv (a row a report) and soak.json (the verdict)
-beside the run folder; exit code 1 if a promise is broken.
+beside the run folder; exit code 1 if one of them fails.
 """
 
 import json
@@ -21,9 +21,9 @@ from qrl.runs import files, record
 from qrl.training import devices, driver, loop
 
 REPORT_STEPS = 1_000_000
-SETTLED = 0.25  # of the reports: what comes after is held against their end
-MEMORY_GROWTH = 1.02  # of the resident memory then
-RETURN_LOSS = 0.05  # of the best return so far
+SETTLED = 0.25  # fraction of the reports after which memory and return are checked
+MEMORY_GROWTH = 1.02  # maximum, relative to the resident memory then
+RETURN_LOSS = 0.05  # maximum drop, relative to the best return
 
 
 def main() -> int:
@@ -40,7 +40,7 @@ def main() -> int:
         print(f"{args.out}: exists already; give another --out", file=sys.stderr)
         return 2
     (args.out / "run").mkdir(parents=True)
-    began, compiled, rows = time.perf_counter(), [0], []
+    start, compiled, rows = time.perf_counter(), [0], []
 
     def count(event: str, duration_secs: float, **_: str | int) -> None:
         compiled[0] += event == "/jax/core/compile/backend_compile_duration"
@@ -48,14 +48,14 @@ def main() -> int:
     jax.monitoring.register_event_duration_secs_listener(count)
 
     def over() -> bool:
-        return time.perf_counter() - began > 3600 * args.hours
+        return time.perf_counter() - start > 3600 * args.hours
 
     not_finite = ""
     try:
         for event in loop.train(tasks.environment(run.task), run, args.out / "run", resume=False, stopped=over):
             if isinstance(event, loop.Reported):
                 report = {name: event.rows[0][name] for name in ("env_steps", "return_mean", "return_min", "success")}
-                seconds = round(time.perf_counter() - began, 1)
+                seconds = round(time.perf_counter() - start, 1)
                 rows.append(report | {"seconds": seconds, "memory_MB": memory_MB(), "compilations": compiled[0]})
                 print(rows[-1], flush=True)
                 files.replace_text(args.out / "soak.csv", files.csv_text(rows))
@@ -70,7 +70,7 @@ def main() -> int:
     ran = {"env_steps": int(rows[-1]["env_steps"]), "seconds": rows[-1]["seconds"], "versions": run.versions}
     (args.out / "soak.json").write_text(json.dumps({**ran, **found}, indent=2) + "\n")
     print(json.dumps(found, indent=2))
-    return 0 if all(promise["kept"] for promise in found.values()) else 1
+    return 0 if all(check["kept"] for check in found.values()) else 1
 
 
 def memory_MB() -> float:
@@ -79,7 +79,7 @@ def memory_MB() -> float:
 
 
 def verdict(rows: list[dict[str, float]]) -> dict[str, dict[str, object]]:
-    """Each promise with what it was held against, what was found, and whether it was kept."""
+    """Each check with its reference, what was measured, and whether it was kept."""
     memory, compilations, returns = (
         np.array([row[name] for row in rows]) for name in ("memory_MB", "compilations", "return_mean")
     )
@@ -89,7 +89,7 @@ def verdict(rows: list[dict[str, float]]) -> dict[str, dict[str, object]]:
     return {
         "memory_MB": {
             "settled": float(memory[settled]),
-            "greatest_after": float(memory[settled:].max()),
+            "max_after": float(memory[settled:].max()),
             "kept": bool(memory[settled:].max() <= MEMORY_GROWTH * memory[settled]),
         },
         "compilations": {
@@ -100,7 +100,7 @@ def verdict(rows: list[dict[str, float]]) -> dict[str, dict[str, object]]:
         "return": {
             "best": best,
             "last": float(returns[-1]),
-            "greatest_drop": drop,
+            "max_drop": drop,
             "kept": bool(drop <= RETURN_LOSS * abs(best)),
         },
     }

@@ -1,15 +1,16 @@
-"""What qrl does in a second: `throughput.py [--only acting physics learning training] --seed N`.
+"""Throughput of qrl: `throughput.py [--only acting physics learning training] --seed N`.
 
-acting     policy 64-64, noise, physics, reward, fresh starts and recording: `rollout.unroll` of hover
-physics    the quadrotor's step alone, thrusts about those of a hover, in blocks of lanes as `rollout.unroll` has them
-learning   samples through draw, gather, symmetries, both networks, V-trace, loss, clip and Adam, in a loop that acts
-           for 1 of 128 updates
-training   environment steps of the whole loop, each sample learnt from as often as by Brax PPO's defaults (16
-           minibatches an unroll, two passes): with unrolls of 50 steps, and of Brax's 10, which makes as many
-           optimiser steps a step of the environment
+acting     steps/s of `rollout.unroll` of hover: policy 64-64, noise, physics, reward, fresh starts and recording
+physics    steps/s of the quadrotor's step by itself, at thrusts near hover, in blocks of lanes as in `rollout.unroll`
+learning   samples/s through sampling, gather, symmetries, both networks, V-trace, loss, clipping and Adam, in a loop
+           with one unroll per 128 updates
+training   environment steps/s of the training loop at the sample reuse of Brax PPO's defaults (16 minibatches per
+           unroll, two passes): with unrolls of 50 steps, and of Brax's 10, which makes as many optimizer steps per
+           environment step
 
-All over the devices that `qrl train hover` makes of this machine's cores, or those that JAX_NUM_CPU_DEVICES says. A
-call makes as many steps, whatever the lanes, as training makes many unrolls in one.
+All on the devices that `qrl train hover` makes of this machine's cores, or as many as JAX_NUM_CPU_DEVICES says. Each
+call makes the same number of environment steps whatever the number of lanes, since a training program runs many
+unrolls per call.
 """
 
 import argparse
@@ -53,31 +54,32 @@ def hover(**learner: Any) -> record.RunConfig:
 
 
 def acting(lanes: int, key: jax.Array) -> None:
-    trainer, states, points = begun(hover(num_envs=lanes, replay_unrolls=1))
-    unrolls = max(1, LANES[-1] // lanes)  # as many steps in each call, which takes time of its own
+    trainer, states, points = make_run(hover(num_envs=lanes, replay_unrolls=1))
+    unrolls = max(1, LANES[-1] // lanes)  # the same number of steps per call, whose overhead then is the same
 
     def act(members: Any, carry: Any, key: Any) -> Any:
-        (learner, starts, here), mine = jax.tree.map(lambda x: x[0], (members, carry))
+        (learner, start_key, inputs), one = jax.tree.map(lambda x: x[0], (members, carry))
 
-        def unroll(i: Any, mine: Any) -> Any:
-            now, ring = mine
-            now, seen = collect(trainer.setup, here.hyper, learner, now, jax.random.fold_in(key, i), starts)
-            return now, replay_buffer.add(ring, seen)
+        def unroll(i: Any, carry: Any) -> Any:
+            lanes, buffer = carry
+            noise_key = jax.random.fold_in(key, i)
+            lanes, transitions = collect(trainer.setup, inputs.hyper, learner, lanes, noise_key, start_key)
+            return lanes, replay_buffer.add(buffer, transitions)
 
-        return jax.tree.map(lambda x: x[None], jax.lax.fori_loop(0, unrolls, unroll, mine))
+        return jax.tree.map(lambda x: x[None], jax.lax.fori_loop(0, unrolls, unroll, one))
 
-    places = LAYOUT.lanes, LAYOUT.buffer
-    program = shard_map(trainer.setup.mesh, act, (P(MEMBER), places, P()), places)
-    acted = jax.jit(program, donate_argnums=1, compiler_options=xla_effort(1))
+    layout = LAYOUT.lanes, LAYOUT.buffer
+    program = shard_map(trainer.setup.mesh, act, (P(MEMBER), layout, P()), layout)
+    compiled = jax.jit(program, donate_argnums=1, compiler_options=xla_effort(1))
     members = states.learner, states.start_key, points
 
-    def on(carry: Any) -> Any:
-        mine, key = carry
-        key, now = jax.random.split(key)
-        return acted(members, mine, now), key
+    def call(carry: Any) -> Any:
+        state, key = carry
+        key, subkey = jax.random.split(key)
+        return compiled(members, state, subkey), key
 
     first = (states.lanes, states.buffer), key
-    rate(f"acting, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, on, first, jax.block_until_ready)
+    rate(f"acting, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, call, first, jax.block_until_ready)
 
 
 def physics(lanes: int, key: jax.Array) -> None:
@@ -91,17 +93,17 @@ def physics(lanes: int, key: jax.Array) -> None:
     def steps(params: Any, thrusts: Any, bodies: Any) -> Any:
         each = jax.vmap(lambda body, thrust: quadrotor.step(params, body, thrust, dt_s))
 
-        def block(of: Any) -> Any:
-            return jax.lax.scan(lambda b, thrust: (each(b, thrust), None), *of)[0]
+        def block(inputs: Any) -> Any:
+            return jax.lax.scan(lambda body, thrust: (each(body, thrust), None), *inputs)[0]
 
-        return jax.lax.fori_loop(0, unrolls, lambda _, now: jax.lax.map(block, (now, thrusts)), bodies)
+        return jax.lax.fori_loop(0, unrolls, lambda _, bodies: jax.lax.map(block, (bodies, thrusts)), bodies)
 
     if mesh:
         steps = jax.shard_map(steps, mesh=mesh, in_specs=(P(), P(SHARD), P(SHARD)), out_specs=P(SHARD), check_vma=False)
     draw = jax.vmap(jax.vmap(lambda k: quadrotor.draw(params.start, k)))
     bodies = draw(jax.random.split(key, (blocks, lanes // blocks)))
-    about = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
-    thrusts = params.physics.hover_thrust_N * about
+    factor = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
+    thrusts = params.physics.hover_thrust_N * factor
     if mesh:
         bodies, thrusts = jax.device_put((bodies, thrusts), NamedSharding(mesh, P(SHARD)))
     step = partial(jax.jit(steps, compiler_options=xla_effort(1)), jax.tree.map(jnp.asarray, params.physics), thrusts)
@@ -112,7 +114,7 @@ def learning(batch_size: int, key: jax.Array) -> None:
     updates = 128
     run = hover(batch_size=batch_size, updates_per_unroll=updates, warmup_unrolls=1, num_timesteps=10**9)
     samples = updates * batch_size * UNROLL_STEPS
-    advancing(f"learning, {batch_size * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
+    measure_advance(f"learning, {batch_size * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
 
 
 def training(unroll_length: int, key: jax.Array) -> None:
@@ -126,24 +128,24 @@ def training(unroll_length: int, key: jax.Array) -> None:
         batch_size=TRAINING_LANES // BRAX_MINIBATCHES,
     )
     unrolls = 200 // unroll_length
-    advancing(TRAINING[unroll_length], run, unrolls, unrolls * run.learner.steps_per_unroll)
+    measure_advance(TRAINING[unroll_length], run, unrolls, unrolls * run.learner.steps_per_unroll)
 
 
-def advancing(figure: str, run: record.RunConfig, unrolls: int, counted: int) -> None:
-    """How much of what is `counted` in so many unrolls the training loop does."""
-    trainer, states, points = begun(run)
+def measure_advance(figure: str, run: record.RunConfig, unrolls: int, per_call: int) -> None:
+    """Report the rate of the training loop, whose `unrolls` count as `per_call`."""
+    trainer, states, points = make_run(run)
     advance = driver.compile_train(trainer, states, points)
     full = run.learner.replay_unrolls
     states = advance(states, points, np.int32(full))
 
-    def on(carry: Any) -> Any:
+    def call(carry: Any) -> Any:
         states, done = carry
         return advance(states, points, np.int32(done + unrolls)), done + unrolls
 
-    rate(figure, counted, on, (states, full), jax.block_until_ready)
+    rate(figure, per_call, call, (states, full), jax.block_until_ready)
 
 
-def begun(run: record.RunConfig) -> tuple[Trainer, Any, Any]:
+def make_run(run: record.RunConfig) -> tuple[Trainer, Any, Any]:
     env = tasks.environment(run.task)
     trainer = make_trainer(env, run.learner, make_mesh(jax.devices(), 1, run.learner.shard_count))
     points = stack([member_inputs(env, run.learner)])

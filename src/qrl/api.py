@@ -1,27 +1,43 @@
-"""The Python API: train a run, load one, fly, evaluate and export its policy. The commands do the same."""
+"""The Python API: train a run, load one, fly, evaluate and export its policy. The commands do the same.
+
+`train` and `load` set what holds for the whole process: JAX's persistent compilation cache (its folder, unless one is
+configured already, and that all programs are kept), a filter that ignores warnings from within Brax, and, until JAX
+initializes its devices, the number of CPU devices that suits the first run. Environment variables: OPENBLAS_NUM_THREADS
+is set to 1 where it is unset; those that `train` sets for XLA are restored.
+"""
 
 import argparse
 import json
+import os
 import time
-from contextlib import ExitStack
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import chex
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
+from qrl import tasks
 from qrl.algorithm.flights import Flights, summarize
 from qrl.cli import train as command
 from qrl.cli.export import export_run
 from qrl.cli.main import configure_jax
 from qrl.cli.terminal import console
-from qrl.config import Config
+from qrl.config import FORMER_NAMES, Config, current_names
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs.record import RunConfig
+from qrl_envs.specfile import BadInput, CountOrZero, nearest
+
+CACHE = "jax_compilation_cache_dir"
+THREADS = "PJRT_NPROC"  # XLA's number of threads, which a run with small products sets
 
 
 class DeployedPolicy:
@@ -86,17 +102,18 @@ class Run:
 
 def load(folder: str | Path) -> Run:
     """The run of one seed in `folder`; BadInput, in one line, if there is none that can be read."""
-    configure_jax()
+    _configure_jax()
     return Run(Path(folder))
 
 
 def train(
-    task: str,
-    *,
-    preset: str | None = None,
+    task: str | Path,
+    vehicle: str | Path | None = None,
     config: Config | str | Path | None = None,
     seed: int = 0,
     out: str | Path | None = None,
+    *,
+    preset: str | None = None,
     resume: bool = False,
     quiet: bool = False,
     **hyperparameters: Any,
@@ -104,28 +121,100 @@ def train(
     """Train a policy and return the run.
 
     task: a name (`qrl tasks` lists them), a path to a .json, or "module:factory" of an environment of your own
-    preset: hyperparameters by name, in place of the task's preset
+    vehicle: a shipped vehicle's name or a path to a .json, in place of the task's own
     config: a Config, or a config.json, whole or in part
-    out: the run folder, by default runs/TASK; `resume` continues a run that it holds
+    out: the run folder, by default runs/TASK
+    preset: hyperparameters by name, in place of the task's preset; not together with a Config, which has them all
+    resume: continue the run that the folder holds; one that is complete is loaded
     quiet: print nothing
-    hyperparameters: fields of `Config`, such as gamma=0.97
+    hyperparameters: fields of `Config`, such as gamma=0.97; NumPy values are welcome
 
-    Raises BadInput where the input is wrong; NotFinite where training diverges.
+    Raises BadInput, in one line, where the input is wrong; NotFinite where training diverges.
     """
-    configure_jax()
+    _configure_jax()
+    named = str(vehicle) if vehicle is not None else None
     if isinstance(config, Config):
-        hyperparameters, config = config.model_dump() | hyperparameters, None
-    flags = {f"learner.{name}": value for name, value in hyperparameters.items()}
-    request: dict[str, Any] = {"task": task, "preset": preset, "config": Path(config) if config else None}
-    request |= {"seed": seed, "seeds": 1, "out": Path(out) if out else None, "resume": resume}
+        if preset is not None:
+            raise BadInput("qrl.train: expected preset or a Config, found both: a Config has all hyperparameters")
+        hyperparameters, config = config.model_dump() | _checked(hyperparameters), None
+    flags = {f"learner.{name}": value for name, value in _checked(hyperparameters).items()}
+    folder = Path(out) if out else Path("runs") / tasks.folder_name(tasks.task_record(str(task), named))
+    if not resume and (folder / "config.json").exists():
+        raise BadInput(f"{folder}: holds a run already; give another out, or resume=True to resume it")
+    request = argparse.Namespace(
+        task=str(task),
+        vehicle=named,
+        config=Path(config) if config else None,
+        seed=_valid("seed", CountOrZero, seed),
+        seeds=1,
+        out=folder,
+        preset=preset,
+        resume=resume,
+        **flags,
+    )
     before, console.quiet = console.quiet, quiet
     try:
         with ExitStack() as stack:
+            stack.enter_context(_environment_restored())
             start_time = time.perf_counter()
-            if plan := command.make_plan(argparse.Namespace(**request, **flags), stack):
+            if plan := command.make_plan(request, stack):
                 finished = command.run(plan, lambda: False)
                 assert finished
                 command.write_results(plan, finished, time.perf_counter() - start_time)
     finally:
         console.quiet = before
-    return load(plan.out if plan else request["out"])
+    return load(folder)
+
+
+def _checked(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Hyperparameters in plain Python under their current names; BadInput names the argument that is wrong."""
+    hints = get_type_hints(Config, include_extras=True)
+    for name in values:
+        if name in FORMER_NAMES:
+            warnings.warn(f"{name} is now {FORMER_NAMES[name]}", FutureWarning, stacklevel=3)
+    values = current_names(values, "qrl.train")
+    for name in values:
+        if name not in Config.model_fields:
+            known = [*Config.model_fields, "preset", "resume", "quiet"]
+            raise BadInput(f"qrl.train: unknown argument '{name}'{nearest(name, known)}")
+    return {name: _valid(name, hints[name], value) for name, value in values.items()}
+
+
+def _valid(name: str, kind: Any, value: Any) -> Any:
+    """`value`, a NumPy or JAX one too, as the annotated type `kind`; no coercion between types."""
+    adapter = TypeAdapter(kind, config=ConfigDict(strict=True, allow_inf_nan=False))
+    try:
+        return adapter.validate_python(_plain(value))
+    except ValidationError as error:
+        problem = error.errors()[0]
+        if problem["type"] == "value_error":  # of our own validators, whose messages are complete
+            raise BadInput(f"qrl.train: {name}: {problem.get('ctx', {})['error']}") from None
+        expected = problem["msg"].replace("Input should be", "expected")
+        raise BadInput(f"qrl.train: {name}: {expected[0].lower()}{expected[1:]}, found {value!r:.60}") from None
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's and JAX's scalars and arrays as Python's numbers and tuples."""
+    if isinstance(value, np.generic | np.ndarray | jax.Array):
+        value = value.tolist()
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
+
+
+def _configure_jax() -> None:
+    """As the commands do, but a cache folder that the program has configured stays."""
+    folder = getattr(jax.config, CACHE)
+    configure_jax()
+    if folder is not None:
+        jax.config.update(CACHE, folder)
+
+
+@contextmanager
+def _environment_restored() -> Iterator[None]:
+    """A run's number of threads is not the user's: the next run, or a child process, is not to take it for that."""
+    before = os.environ.get(THREADS)
+    try:
+        yield
+    finally:
+        os.environ.pop(THREADS, None)
+        if before is not None:
+            os.environ[THREADS] = before

@@ -66,12 +66,15 @@ class Marked(Fenced):
     Where x is positive too, it says that nothing begins there any more.
     """
 
+    def __init__(self, mark: str) -> None:
+        self.mark = mark
+
     def at(self, x: jax.Array) -> State:
         left = x[Y] > x[FENCE]
         return (
             super()
             .at(x)
-            .replace(info={"truncated": jnp.float32(left), "out_of_bounds": jnp.float32(left & (x[X] > 0.0))})
+            .replace(info={self.mark: jnp.float32(left), "out_of_bounds": jnp.float32(left & (x[X] > 0.0))})
         )
 
     def restart(self, state: State, rng: jax.Array) -> State:
@@ -117,7 +120,7 @@ def fly(env: Fenced, lanes: Lanes, seed: int) -> Flight:
     return Flight(env, begun, lanes, steps)
 
 
-PLAIN, MARKED = Fenced(), Marked()
+PLAIN, MARKED, BRAXS = Fenced(), Marked("truncated"), Marked("truncation")
 
 
 def begin(env: Fenced, seed: int, fence: float = 1.2) -> Lanes:
@@ -136,9 +139,9 @@ def flown(env: Fenced) -> Flight:
     return fly(env, begin(env, seed=0), seed=0)
 
 
-@pytest.fixture(params=["plain", "marked"])
+@pytest.fixture(params=[PLAIN, MARKED, BRAXS], ids=["plain", "truncated", "truncation"])
 def flight(request: pytest.FixtureRequest) -> Flight:
-    return flown({"plain": PLAIN, "marked": MARKED}[request.param])
+    return flown(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +168,7 @@ def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
             np.testing.assert_allclose(steps.observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
             state = step(state, np.clip(steps.action[i, t], -1.0, 1.0))
             age += 1
-            terminated = bool(state.done) and not bool(state.info.get("truncated", 0.0))
+            terminated = bool(state.done) and not bool(state.info.get(getattr(flight.env, "mark", ""), 0.0))
             truncated = not terminated and (bool(state.done) or age == LONGEST)
             np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-5, atol=1e-5)
@@ -177,7 +180,7 @@ def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
     terminations, own_truncations, out_of_time = seen
     assert terminations > 3
     assert out_of_time > 3 or flight.env is PLAIN
-    assert (own_truncations > 3) == (flight.env is MARKED)
+    assert (own_truncations > 3) == (flight.env is not PLAIN)
 
 
 def test_next_observation_is_that_before_the_reset(flight: Flight) -> None:
@@ -354,7 +357,7 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
 
     But for when its next start is drawn, which is when some lane beside it needs one.
     """
-    env = Marked()
+    env = Marked("truncated")
 
     def run() -> tuple[Any, ...]:
         key = jax.random.PRNGKey(3)

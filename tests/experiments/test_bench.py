@@ -1,4 +1,4 @@
-"""The benchmark's own instruments: its judge, its clock, its arithmetic, and what it makes of a peer that is absent."""
+"""The benchmark's own instruments: its judge, its clock, its arithmetic, and what it does without a baseline."""
 
 import json
 import math
@@ -48,11 +48,11 @@ def test_the_judges_pendulum_is_ours() -> None:
         return np.sign(observation[:, 2:] * observation[:, :1] + 0.1) * (1.2 - observation[:, 1:2])
 
     env = worlds.make("pendulum")
-    begun = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), len(theta)))
-    lane = begun.pipeline_state
+    start = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), len(theta)))
+    lane = start.pipeline_state
     x = lane.x._replace(pose=jnp.asarray(theta, jnp.float32), twist=jnp.asarray(rate, jnp.float32))
     observed = jnp.stack([jnp.cos(x.pose), jnp.sin(x.pose), x.twist], axis=1)
-    state = begun.replace(pipeline_state=lane._replace(x=x), obs=observed)
+    state = start.replace(pipeline_state=lane._replace(x=x), obs=observed)
     step, total = jax.jit(jax.vmap(env.step)), np.zeros(len(theta))
     alone = theta, rate
     for _ in range(30):  # in single precision these flights part later on
@@ -84,7 +84,7 @@ def test_the_judges_starts_stand_for_the_tasks() -> None:
 
 def test_a_policy_that_is_not_finite_is_never_solved() -> None:
     assert math.isnan(judge.pendulum_return(lambda o: np.full((len(o), 1), np.nan)))
-    assert first_at(run("peer", 0, check(1, math.nan, 1.0)), "return_mean", -150.0) is None
+    assert first_at(run("baseline", 0, check(1, math.nan, 1.0)), "return_mean", -150.0) is None
 
 
 def test_overlapping_spans_count_once() -> None:
@@ -121,7 +121,7 @@ def test_the_clock_leaves_out_checks_and_compilation(
 
 def test_brax_is_told_of_truncations() -> None:
     """Out of bounds, and not otherwise; and its lane starts anew all the same."""
-    env = brax_ppo.wrapped(envs.get_environment("hover"), episode_length=2)
+    env = brax_ppo.wrap(envs.get_environment("hover"), episode_length=2)
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     lane = state.pipeline_state
     pose = lane.x.pose
@@ -137,11 +137,11 @@ def test_brax_is_told_of_truncations() -> None:
 
 def test_solved_is_the_first_check_that_reaches_the_bar() -> None:
     checks = check(10, -200.0, 1.0), check(20, -149.0, 2.0), check(30, -300.0, 3.0), check(40, -140.0, 4.0)
-    assert to_solve(run("peer", 0, *checks), "steps") == 20
-    assert to_solve(run("peer", 0, *checks), "train_seconds", -145.0) == 4.0
-    assert to_solve(run("peer", 0, *checks), "steps", -100.0) == math.inf
-    assert to_solve(run("peer", 0), "steps") == math.inf
-    assert to_solve(run("peer", 0, {"steps": 10, "return_mean": None}), "steps") == math.inf
+    assert to_solve(run("baseline", 0, *checks), "steps") == 20
+    assert to_solve(run("baseline", 0, *checks), "train_seconds", -145.0) == 4.0
+    assert to_solve(run("baseline", 0, *checks), "steps", -100.0) == math.inf
+    assert to_solve(run("baseline", 0), "steps") == math.inf
+    assert to_solve(run("baseline", 0, {"steps": 10, "return_mean": None}), "steps") == math.inf
 
 
 def test_spreads_and_ratios() -> None:
@@ -185,12 +185,12 @@ def test_rates_are_held_against_each_other() -> None:
 
     one = [rates("qrl", s, training=10.0 + s, acting_256=4.0, acting_1024=5.0, acting_4096=4.5) for s in range(3)]
     told = [rates("qrl, one device", s, training=5.0) for s in range(2)]
-    peer = [rates("Brax", 0, training=2.0), rates("Brax, two devices", 0, training=4.0)]
-    text = derived([*one, *told, *peer])
-    assert "| training, its own choice over one device | qrl | 2.1× [2 … 2.2] |" in text
-    assert "| training, two devices, over its own choice | Brax | 2× [2 … 2] |" in text
-    assert "| training, two devices | Brax | 4 [4 … 4] | 2.5× [2.5 … 2.5] |" in speed([*one, *told, *peer])
-    assert "dearest of 3 numbers of lanes over the cheapest | qrl | 1.25× [1.25 … 1.25] |" in text
+    baseline = [rates("Brax", 0, training=2.0), rates("Brax, two devices", 0, training=4.0)]
+    text = derived([*one, *told, *baseline])
+    assert "| training, its default over one device | qrl | 2.1× [2 … 2.2] |" in text
+    assert "| training, two devices, over its default | Brax | 2× [2 … 2] |" in text
+    assert "| training, two devices | Brax | 4 [4 … 4] | 2.5× [2.5 … 2.5] |" in speed([*one, *told, *baseline])
+    assert "highest cost over its lowest, of 3 numbers of lanes | qrl | 1.25× [1.25 … 1.25] |" in text
     assert derived([]) == ""
 
 
@@ -210,20 +210,20 @@ def test_a_command_tells_the_worst_of_its_checkpoints() -> None:
     )
 
 
-def test_a_peer_that_never_solves_gets_a_bound_in_the_picture() -> None:
+def test_a_baseline_that_never_solves_gets_a_bound_in_the_picture() -> None:
     bar = next(bar for bar in bars(RUNS) if bar.label == "pendulum: rejax PPO" and bar.kind == "training")
     assert bar.bound
     assert bar.ratio.median == 10.0  # 30 s against 3
 
 
-def test_a_peer_that_cannot_be_installed_is_skipped(
+def test_a_baseline_that_cannot_be_installed_is_skipped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     failed = subprocess.CompletedProcess([], 1, stdout="", stderr="collecting\nERROR: no ghost-1.0\n")
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: failed)
     (tmp_path / "ghost.txt").write_text("ghost==1.0\n")
-    peer = Contestant("ghost", "pendulum", "ghost.py", (), "ghost")
-    pythons, absent = bench.installed([peer], tmp_path, tmp_path / "environments")
+    baseline = Contestant("ghost", "pendulum", "ghost.py", (), "ghost")
+    pythons, absent = bench.installed([baseline], tmp_path, tmp_path / "environments")
     assert pythons == {None: Path(sys.executable)}
     assert absent == {"ghost": "ERROR: no ghost-1.0"}
     assert "skipped" in capsys.readouterr().out
@@ -231,7 +231,7 @@ def test_a_peer_that_cannot_be_installed_is_skipped(
 
 
 def test_an_environment_is_reused_until_its_pins_change(tmp_path: Path) -> None:
-    pins, folder = tmp_path / "peer.txt", tmp_path / "environment"
+    pins, folder = tmp_path / "baseline.txt", tmp_path / "environment"
     (tmp_path / "lock.txt").write_text("# none\n")
     pins.write_text("-c lock.txt\n")
     (folder / "bin").mkdir(parents=True)
@@ -245,9 +245,9 @@ def test_an_environment_is_reused_until_its_pins_change(tmp_path: Path) -> None:
 def test_a_run_leaves_its_lines_and_ends_on_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "BASELINES", tmp_path)
     monkeypatch.setattr(bench, "GRACE_SECONDS", 0.0)
-    (tmp_path / "peer.py").write_text("import time\nprint('BENCH {\"steps\": 1}', flush=True)\ntime.sleep(60)\n")
+    (tmp_path / "other.py").write_text("import time\nprint('BENCH {\"steps\": 1}', flush=True)\ntime.sleep(60)\n")
     (tmp_path / "broken.py").write_text("print('BENCH {\"steps\": 2}')\nraise ValueError('a reason')\n")
-    found = bench.run_contestant(Contestant("peer", "pendulum", "peer.py"), Path(sys.executable), 3, 2.0, tmp_path)
+    found = bench.run_contestant(Contestant("baseline", "pendulum", "other.py"), Path(sys.executable), 3, 2.0, tmp_path)
     assert (found["outcome"], found["lines"], found["seed"]) == ("out of time", [{"steps": 1}], 3)
     found = bench.run_contestant(Contestant("broken", "pendulum", "broken.py"), Path(sys.executable), 0, 60.0, tmp_path)
     assert (found["outcome"], found["lines"]) == ("exit code 1", [{"steps": 2}])
@@ -256,24 +256,24 @@ def test_a_run_leaves_its_lines_and_ends_on_time(tmp_path: Path, monkeypatch: py
 
 def test_a_run_is_made_once(tmp_path: Path) -> None:
     """And again if it failed, was asked for otherwise, or elsewhere."""
-    peer, path = Contestant("qrl", "pendulum", "qrl_train.py", ("--steps", "1")), tmp_path / "run.json"
-    assert not bench.is_current(path, peer, 60.0)
-    here = bench.run_fingerprint(peer)
+    baseline, path = Contestant("qrl", "pendulum", "qrl_train.py", ("--steps", "1")), tmp_path / "run.json"
+    assert not bench.is_current(path, baseline, 60.0)
+    here = bench.run_fingerprint(baseline)
     assert "commit" not in here
     asked = {"command": ["qrl_train.py", "--steps", "1"], "budget_seconds": 60.0}
     kept = asked | {"fingerprint": here, "outcome": "done"}
     path.write_text(json.dumps(kept))
-    assert bench.is_current(path, peer, 60.0)
-    assert not bench.is_current(path, peer, 90.0)
-    assert not bench.is_current(path, peer._replace(words=("--steps", "2")), 60.0)
-    assert not bench.is_current(path, peer._replace(devices=2), 60.0)
+    assert bench.is_current(path, baseline, 60.0)
+    assert not bench.is_current(path, baseline, 90.0)
+    assert not bench.is_current(path, baseline._replace(words=("--steps", "2")), 60.0)
+    assert not bench.is_current(path, baseline._replace(devices=2), 60.0)
     for other in ({"CPU": "abacus"}, {"jax": "0.1"}, {"requirements": "others"}, {"code": "other"}):
         path.write_text(json.dumps(kept | {"fingerprint": here | other}))
-        assert not bench.is_current(path, peer, 60.0)
+        assert not bench.is_current(path, baseline, 60.0)
     path.write_text(json.dumps(asked | {"outcome": "done"}))
-    assert not bench.is_current(path, peer, 60.0)
+    assert not bench.is_current(path, baseline, 60.0)
     path.write_text(json.dumps(kept | {"outcome": "exit code 1"}))
-    assert not bench.is_current(path, peer, 60.0)
+    assert not bench.is_current(path, baseline, 60.0)
 
 
 @pytest.mark.parametrize(

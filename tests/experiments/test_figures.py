@@ -372,7 +372,7 @@ def test_the_pendulum_is_held_against_ppo() -> None:
     assert verdict((high, lower), (idle, as_idle)) == EXCEEDED
     found = captions.pendulum([Rate("x: 1", high, low), Rate("y: 2", idle, as_idle)]).found
     assert "| x: 1 | -145.0 [-147.5 … -142.5] | -172.5 [-186.2 … -158.8] | ours, by the median |" in found
-    assert "Within these steps hardly anything is learnt by either at: y: 2." in found
+    assert "Within these steps hardly anything is learned by either at: y: 2." in found
 
 
 def test_flights_are_told_with_their_verdicts() -> None:

@@ -98,7 +98,8 @@ def test_every_picture_is_there(made: Path) -> None:
 def test_each_claim_has_its_verdict(made: Path) -> None:
     for name, told in CAPTIONS.items():
         assert f"| [{told.title}](#{name}) | claims {name} | **{told.verdict}** |" in made.read_text()
-        assert f"- {name} is 3.\n\n**{told.verdict.capitalize()}.** By a rule.\n" in made.read_text()
+        verdict = f"**{told.verdict.capitalize()}.** By a rule.\n([How it was made.](gallery/{name}.md))\n"
+        assert f"- {name} is 3.\n\n{verdict}" in made.read_text()
 
 
 def test_numbers_are_those_of_the_evaluation(made: Path) -> None:

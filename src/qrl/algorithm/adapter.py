@@ -49,6 +49,16 @@ class _Adapted:
 
 
 def adapt(env: Env) -> TaskEnv:
-    """`env` itself where it offers every ability of a `TaskEnv`, else a view of it with defaults for the others."""
+    """`env` itself where it offers every ability of a `TaskEnv`, else a view of it with defaults for the others.
+
+    `params` and `with_params` are one ability: a program passes the one through the other. ValueError for half of it,
+    whose parameters would be ignored silently.
+    """
+    halves = "params", "with_params"
+    found = [name for name in halves if hasattr(env, name)]
+    if len(found) == 1:
+        missing = next(name for name in halves if name not in found)
+        expected = "expected both 'params' and 'with_params(params)', or neither"
+        raise ValueError(f"{type(env).__name__}: {expected}; '{missing}' is missing")
     task_env: Any = env if all(hasattr(env, name) for name in _ABILITIES) else _Adapted(env)
     return task_env

@@ -1,1 +1,1 @@
-"""A trained run, loaded once for all who fly it."""
+"""A trained run, loaded once for every command that flies it; evaluation starts, baselines, calibration."""

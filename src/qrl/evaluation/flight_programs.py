@@ -1,4 +1,4 @@
-"""Compiled flights of float policies. All that this package uses of Trainer, Learner and checkpoints is here."""
+"""Compiled flights of float policies of one configuration, and the checkpoints that hold them."""
 
 from collections.abc import Iterator
 from concurrent.futures import Executor, Future

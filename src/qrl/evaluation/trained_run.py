@@ -131,7 +131,7 @@ class TrainedRun:
             provenance=Provenance(
                 run=self.folder.resolve().name,
                 task=self.config.task.name,
-                description=self.task.description if self.task else "another environment",
+                description=self.task.description if self.task else "an environment without a task file",
                 commit=self.config.versions.get("commit", "unknown"),
                 seed=self.config.seed,
                 env_steps=self.env_steps,
