@@ -34,7 +34,7 @@ LITTLE = {
     "apg_episode_length": 20,
 }
 TEN_UPDATES = 3  # unrolls
-CLIMBS = 3
+APG_UPDATES = 3
 
 
 def named(tree: Any) -> dict[str, np.ndarray]:
@@ -58,9 +58,9 @@ def main(folder: Path) -> None:
             if count == 2:
                 continue
             learnt = device_put(trainer.setup.mesh, stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))
-            until = config.learning_unrolls + CLIMBS * config.unrolls_per_apg_update
-            climbed = trainer.apg(learnt, points, np.int32(until))
-            np.savez(folder / f"climbed-{count}.npz", **named(trainer.gather(climbed)))
+            until = config.learning_unrolls + APG_UPDATES * config.unrolls_per_apg_update
+            polished = trainer.apg(learnt, points, np.int32(until))
+            np.savez(folder / f"polished-{count}.npz", **named(trainer.gather(polished)))
 
 
 if __name__ == "__main__":

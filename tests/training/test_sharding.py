@@ -22,7 +22,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Values]:
     """What `on_devices` leaves, by "SEEDS-DEVICES"."""
     out = tmp_path_factory.mktemp("devices")
     program = Path(__file__).parents[1] / "helpers" / "on_devices.py"
-    # It runs for milliseconds: XLA's optimisations would take most of the time.
+    # It runs for milliseconds: XLA's optimizations would take most of the time.
     env = os.environ | {"JAX_NUM_CPU_DEVICES": "8", "JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     done = subprocess.run([sys.executable, program, out], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -30,7 +30,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Values]:
 
 
 def of_training(values: Values) -> Values:
-    """Without what only says when starts were drawn, which a lane's neighbours decide."""
+    """Without what only says when starts were drawn, which a lane's neighbors decide."""
     idle = (".lanes.next_state_used", ".lanes.next_state", ".lanes.reset_count")
     return {name: x for name, x in values.items() if not any(part in name for part in idle)}
 
@@ -69,8 +69,8 @@ def test_what_one_device_saved_goes_on_over_several(trained: dict[str, Values], 
 
 def test_flights_of_the_analytic_gradient_are_shared(trained: dict[str, Values]) -> None:
     """Three of its updates, as on one device."""
-    assert trained["climbed-1"][".learner.updates"] == 13
-    assert_same(of_training(trained["climbed-8"]), of_training(trained["climbed-1"]))
+    assert trained["polished-1"][".learner.updates"] == 13
+    assert_same(of_training(trained["polished-8"]), of_training(trained["polished-1"]))
 
 
 @pytest.mark.parametrize(
