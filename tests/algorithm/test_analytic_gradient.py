@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+import small_run
 from bound_learner import BoundLearner
 from fault_injection import assert_same_leaves, leaves
 from qrl import tasks
@@ -22,7 +23,6 @@ from qrl.runs import checkpoint, files
 from qrl.training import driver
 from qrl.training.state import FAULT_TERMS, MemberInputs, TrainState, member_inputs, stack
 from qrl.training.trainer import Trainer, make_trainer
-from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 from small_run import comparable_metrics, run_config, train
 
@@ -260,7 +260,7 @@ def test_what_cannot_be_is_said(changes: dict[str, object], says: str) -> None:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole")
-    train(out, run_config(**WITH_APG), worlds.make("pendulum"))
+    train(out, run_config(**WITH_APG), small_run.pendulum())
     return out
 
 
@@ -276,108 +276,113 @@ def test_a_run_ends_with_its_apg_updates(whole: Path) -> None:
 
 def test_reports_during_apg_wait_for_an_update(tmp_path: Path) -> None:
     """Asked for oftener than there are updates: no row is without numbers, and none without an update."""
-    train(tmp_path, run_config(**WITH_APG, num_evals=30), worlds.make("pendulum"))
+    train(tmp_path, run_config(**WITH_APG, num_evals=30), small_run.pendulum())
     rows = files.read_metrics(tmp_path)
     assert [row["env_steps"] for row in rows] == [*range(40, 721, 40), *range(800, 1201, 80)]
     assert all(np.isfinite([row["reward_mean"], row["steps_per_second"]]).all() for row in rows)
     assert [row["updates"] for row in rows[-6:]] == [34 + i for i in range(1, 7)]
 
 
-class Fleeing(Pushed):
-    """Every flight ends at once."""
+class Odd(Pushed):
+    """Its flights, rewards or gradients fail, as its parameters say: one environment, whose programs fit all."""
 
     def __init__(self) -> None:
-        super().__init__(edge=0.0)
+        super().__init__()
+        self.params = self.but()
 
+    @staticmethod
+    def but(edge: float = 1e9, nan: float = 0.0, sharp: float = 0.0) -> dict[str, jax.Array]:
+        """Where flights end; whether rewards are no numbers; whether the rewards' gradients are none."""
+        return {"edge": jnp.float32(edge), "nan": jnp.float32(nan), "sharp": jnp.float32(sharp)}
 
-def test_flights_that_end_early_are_counted(tmp_path: Path) -> None:
-    """And are charged in the mean reward, so that it is not at its best."""
-    train(tmp_path, run_config(**WITH_APG, num_evals=1), Fleeing())
-    (row,) = files.read_metrics(tmp_path)
-    assert row["ended_early"] == 1.0
-    assert row["reward_mean"] < -0.1
+    def with_params(self, params: dict[str, jax.Array]) -> "Odd":
+        other = Odd()
+        other.params = params
+        return other
 
+    def reset(self, rng: jax.Array) -> State:
+        return super().reset(rng).replace(pipeline_state=self.params)
 
-class Nowhere(Pushed):
-    """Its rewards are not numbers once it is flown for a while."""
+    def restart(self, state: State, rng: jax.Array) -> State:
+        return self.with_params(state.pipeline_state).reset(rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        return super().step(state, action).replace(reward=jnp.where(jnp.abs(state.obs[0]) > 0.0, jnp.nan, 0.0))
+        params, after = state.pipeline_state, super().step(state, action)
+        zero = jnp.where(params["sharp"] > 0, after.obs[0] - after.obs[0], 1.0)
+        spoiled = jnp.where(params["nan"] > 0, jnp.nan, after.reward) - params["sharp"] * jnp.sqrt(zero)
+        done = (jnp.abs(after.obs[0]) > params["edge"]).astype(jnp.float32)
+        return after.replace(pipeline_state=params, reward=spoiled, done=done, info={"out_of_bounds": done})
 
 
-def at_apg(env: Env, config: Config) -> tuple[Trainer, MemberInputs, TrainState]:
+ODD = Odd()
+MANY_UPDATES = run_config(**WITH_APG | {"num_timesteps": 4800, "num_evals": 5})
+
+
+def at_apg(**odd: float) -> tuple[Trainer, MemberInputs, TrainState]:
     """A trainer and a state at the end of learning, without having learned."""
-    trainer, inputs = make_trainer(env, config), stack([member_inputs(env, config)])
+    config = MANY_UPDATES.learner
+    assert config.num_apg_updates == 24
+    trainer = small_run.trainer_of(ODD, config)
+    inputs = stack([MemberInputs(config.hyperparameters, jax.tree.map(np.asarray, Odd.but(**odd)))])
     states = trainer.init(driver.seeds(0, 1), inputs)
     return trainer, inputs, states._replace(unrolls=jnp.full(1, config.learning_unrolls, jnp.int32))
 
 
+def after(updates: int, trainer: Trainer, inputs: MemberInputs, states: TrainState) -> TrainState:
+    until = int(states.unrolls[0]) + updates * trainer.config.unrolls_per_apg_update
+    return trainer.apg(states, inputs, np.int32(until))
+
+
+def test_flights_that_end_early_are_counted() -> None:
+    """And are charged in the mean reward, so that it is not at its best."""
+    totals = after(2, *at_apg(edge=0.0)).totals
+    assert (totals.episodes, totals.early, totals.steps) == (8, 8, 2 * 4 * 20)
+    assert totals.rewards / totals.steps < -0.1
+
+
 def test_rewards_that_are_no_numbers_stop_apg() -> None:
     """The fault is the run's, as it is while it learns."""
-    config = run_config(**WITH_APG).learner
-    trainer, inputs, states = at_apg(Nowhere(), config)
-    after = trainer.apg(states, inputs, np.int32(config.num_unrolls))
-    assert (after.fault_update, after.fault_term) == (0, 0)
-
-
-class Sharp(Pushed):
-    """Its gradient is not finite where its parameter is not 0; its rewards are."""
-
-    def __init__(self, sharp: float) -> None:
-        super().__init__()
-        self.params = jnp.float32(sharp)
-
-    def with_params(self, params: jax.Array) -> "Sharp":
-        return Sharp(params)  # pyright: ignore[reportArgumentType]
-
-    def step(self, state: State, action: jax.Array) -> State:
-        after = super().step(state, action)
-        zero = jnp.where(self.params > 0, after.obs[0] - after.obs[0], 1.0)
-        return after.replace(reward=after.reward - self.params * jnp.sqrt(zero))
+    stopped = after(2, *at_apg(nan=1.0))
+    assert (stopped.fault_update, FAULT_TERMS[int(stopped.fault_term[0])]) == (0, "reward")
 
 
 def test_skipped_updates_are_counted_and_twenty_in_a_row_are_a_fault() -> None:
-    """In between one that is not skipped, they are not in a row."""
-    config = run_config(**WITH_APG | {"num_timesteps": 4800}).learner
-    assert config.num_apg_updates == 24
-    trainer, inputs, states = at_apg(Sharp(1.0), config)
-    kind = inputs._replace(env_params=np.float32([0.0]))
+    """They are not in a row where one in between is not skipped."""
+    trainer, inputs, states = at_apg(sharp=1.0)
+    kind = at_apg()[1]
 
-    def on(states: TrainState, updates: int, inputs: MemberInputs = inputs) -> TrainState:
-        until = states.unrolls[0] + updates * config.unrolls_per_apg_update
-        return trainer.apg(states, inputs, np.int32(until))
+    def seen(states: TrainState) -> tuple[int, int, int]:
+        return int(states.totals.skipped[0]), int(states.skipped_in_a_row[0]), int(states.fault_update[0])
 
-    states = on(states, 15)
-    assert (states.totals.skipped, states.skipped_in_a_row, states.fault_update) == (15, 15, -1)
-    states = on(states, 1, kind)
-    assert (states.totals.skipped, states.skipped_in_a_row, states.fault_update) == (15, 0, -1)
-    states = on(states, 8)
-    assert (states.totals.skipped, states.skipped_in_a_row, states.fault_update) == (23, 8, -1)
-    states = on(states._replace(skipped_in_a_row=jnp.full(1, 18, jnp.int32)), 1)
-    assert states.fault_update == -1
-    states = on(states, 1)
-    assert (states.fault_update, FAULT_TERMS[int(states.fault_term[0])]) == (25, "policy_gradient")
+    states = after(15, trainer, inputs, states)
+    assert seen(states) == (15, 15, -1)
+    states = after(1, trainer, kind, states)
+    assert seen(states) == (15, 0, -1)
+    states = after(8, trainer, inputs, states)
+    assert seen(states) == (23, 8, -1)
+    states = states._replace(skipped_in_a_row=jnp.full(1, 18, jnp.int32), unrolls=states.unrolls - 8)
+    states = after(1, trainer, inputs, states)
+    assert seen(states) == (24, 19, -1)
+    states = after(1, trainer, inputs, states)
+    assert seen(states) == (25, 20, 25)
+    assert FAULT_TERMS[int(states.fault_term[0])] == "policy_gradient"
 
 
-def test_a_run_whose_updates_are_skipped_on_and_on_stops(tmp_path: Path) -> None:
-    """With a line that names the gradient; where few are skipped, the row has their number."""
-    few, many = run_config(**WITH_APG, num_evals=1), run_config(**WITH_APG | {"num_timesteps": 4800}, num_evals=1)
-    train(tmp_path / "few", few, Sharp(1.0))
-    assert [row["apg_skipped"] for row in files.read_metrics(tmp_path / "few")] == [6.0]
+def test_a_run_whose_updates_are_skipped_on_and_on_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a line that names the gradient; the rows before have the number of skipped ones."""
+    monkeypatch.setattr(ODD, "params", Odd.but(sharp=1.0))
     with pytest.raises(driver.NotFinite, match="policy_gradient is not finite in update"):
-        train(tmp_path / "many", many, Sharp(1.0))
+        train(tmp_path, MANY_UPDATES, ODD)
+    assert [row["apg_skipped"] for row in files.read_metrics(tmp_path)] == [0.0, 0.0, 0.0, 12.0]
 
 
 def test_every_update_flies_starts_of_its_own() -> None:
-    """The same policy, a step size of 0: another mean return each time."""
-    config = run_config(**WITH_APG, apg_learning_rate=1e-30).learner
-    trainer, inputs, states = at_apg(Pushed(), config)
+    """The policy hardly moves: yet each has another mean return."""
+    trainer, inputs, states = at_apg()
+    slow = inputs._replace(hyper=inputs.hyper._replace(apg_learning_rate=np.full(1, 1e-30, np.float32)))
     found = []
-    for update in range(1, 5):
-        states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
-        states = trainer.apg(
-            states, inputs, np.int32(config.learning_unrolls + update * config.unrolls_per_apg_update)
-        )
+    for _ in range(4):
+        states = after(1, trainer, slow, states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals)))
         found.append(float(states.totals.rewards[0]))
     assert len(set(found)) == 4
 
@@ -400,7 +405,7 @@ def test_an_environment_without_a_gradient_is_told_before_training() -> None:
 
 @pytest.mark.parametrize("stop_after", [21, 22])
 def test_stopped_during_apg_it_goes_on_to_the_same_bits(tmp_path: Path, whole: Path, stop_after: int) -> None:
-    env, run = worlds.make("pendulum"), run_config(**WITH_APG)
+    env, run = small_run.pendulum(), run_config(**WITH_APG)
     train(tmp_path, run, env, stop_after=stop_after)
     reached = checkpoint.saved_steps(tmp_path)[0]
     assert 720 < reached < 1200
@@ -411,8 +416,8 @@ def test_stopped_during_apg_it_goes_on_to_the_same_bits(tmp_path: Path, whole: P
 
 def test_members_do_not_mix(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Vmapped beside another, a seed's updates are its own."""
-    env, config = worlds.make("pendulum"), run_config(**WITH_APG).learner
-    trainer = make_trainer(env, config)
+    env, config = small_run.pendulum(), run_config(**WITH_APG).learner
+    trainer = small_run.trainer_of(env, config)
     learning, all_of_it = np.int32(config.learning_unrolls), np.int32(config.num_unrolls)
 
     def polished(count: int) -> list[np.ndarray]:
