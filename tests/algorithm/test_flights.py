@@ -39,7 +39,7 @@ class Drifting(Env):
 
 @pytest.mark.parametrize("constant", [0.0, 2.0])
 def test_flights_are_those_of_a_literal_loop(constant: float) -> None:
-    """Out of bounds the last reward goes on, whatever its sign; after a termination there is none. What ended is NaN."""
+    """Out of bounds the last reward goes on, whatever its sign; after a termination there is none. An end is NaN."""
     env, keys = Drifting(constant), jax.random.split(jax.random.PRNGKey(0), 12)
     found = jax.jit(lambda keys: flights.fly(env, lambda o: -0.5 * o, keys, STEPS))(keys)
     step, ended = jax.jit(env.step), []

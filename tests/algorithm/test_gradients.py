@@ -4,7 +4,8 @@ The surrogate's targets, weights and advantages are constants: Algorithm 1 in Nu
 or objective of qrl is in it.
 """
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -106,9 +107,9 @@ def mlp(params: Any, x: Any) -> Any:
 
 
 def log_pi(learner: BoundLearner, progress: float, policy: Any, d: Transition) -> Any:
-    c = learner.config
-    sigma = c.sigma ** (1 - progress) * c.sigma_end**progress
-    z = (d.action - mlp(policy, d.observation * np.array(CHANGES["observation_scale"]))) / sigma
+    hyper = learner.hyper
+    sigma = hyper.sigma ** (1 - progress) * hyper.sigma_end**progress
+    z = (d.action - mlp(policy, d.observation * hyper.observation_scale)) / sigma
     return (-(z**2) / 2 - np.log(sigma * np.sqrt(2 * np.pi))).sum(-1)
 
 
@@ -120,7 +121,7 @@ class Constants(NamedTuple):
 def constants(learner: BoundLearner, progress: float, params: Networks, d: Transition) -> Constants:
     """Algorithm 1, one sample after the other."""
     c, hyper = learner.config, jax.tree.map(float, learner.hyper._replace(observation_scale=None))
-    scale, horizon = np.array(CHANGES["observation_scale"]), 1.0 / (1.0 - hyper.gamma)
+    scale, horizon = learner.hyper.observation_scale, 1.0 / (1.0 - hyper.gamma)
     low, high = (hyper.reward_scaling * horizon * x for x in (min(d.reward.min(), 0.0), max(d.reward.max(), 0.0)))
     v, v_next = (np.clip(mlp(params.critic, x * scale)[..., 0], low, high) for x in (d.observation, d.next_observation))
     ratio = np.exp(log_pi(learner, progress, params.policy, d) - d.log_mu)
@@ -148,13 +149,24 @@ def constants(learner: BoundLearner, progress: float, params: Networks, d: Trans
     return Constants(advantage, target)
 
 
+@functools.cache
+def surrogate_gradient(learner: BoundLearner) -> Callable[..., tuple[Any, Networks]]:
+    """Compiled: ((sum of losses, each), gradient)."""
+
+    def losses(params: Networks, progress: jax.Array, d: Transition, known: Constants) -> tuple[jax.Array, Networks]:
+        each = surrogate(learner, progress, params, d, known)
+        return each.policy + each.critic, each
+
+    return jax.jit(jax.value_and_grad(losses, has_aux=True))
+
+
 def surrogate(learner: BoundLearner, progress: float, params: Networks, d: Transition, known: Constants) -> Networks:
     """The policy's loss and the critic's."""
     c, a = learner.config, known.advantage
     log_density = log_pi(learner, progress, params.policy, d)
     gain = jnp.exp(log_density - d.log_mu) - 1 if c.form == "ratio" else jnp.exp(log_density) - jnp.exp(d.log_mu)
-    limit = c.epsilon * np.abs(a) if c.xi is None else c.xi
-    v = mlp(params.critic, d.observation * np.array(CHANGES["observation_scale"]))[..., 0]
+    limit = learner.hyper.epsilon * jnp.abs(a) if c.xi is None else learner.hyper.xi
+    v = mlp(params.critic, d.observation * learner.hyper.observation_scale)[..., 0]
     return Networks(-jnp.mean(jnp.minimum(gain * a, limit)), jnp.mean((v - known.target) ** 2))
 
 
@@ -166,10 +178,9 @@ def assert_literal(learner: BoundLearner, update: Any, data: Transition, critic:
     noise = np.random.default_rng(5).normal(size=data.reward.shape)
     data = data._replace(log_mu=np.asarray(log_pi(learner, progress, state.params.policy, data)) + 0.4 * noise)
     known = constants(learner, progress, state.params, data)
-    each = surrogate(learner, progress, state.params, data, known)
+    (_, each), slope = surrogate_gradient(learner)(state.params, progress, data, known)
     after, terms = update(state, data)
     np.testing.assert_allclose((terms.policy_loss, terms.value_loss), each, rtol=1e-9)
-    slope = jax.grad(lambda params: sum(surrogate(learner, progress, params, data, known)))(state.params)
     for before, ours, adam, expected in zip(state.params, after.params, after.optimizer, slope, strict=True):
         flat, _ = ravel_pytree(expected)
         assert np.abs(flat).max() > 1e-3

@@ -46,7 +46,14 @@ def pendulum() -> Env:
     return worlds.make("pendulum")
 
 
-trainer_of = functools.cache(make_trainer)  # of an environment, by its identity, and a configuration
+_make_once = functools.cache(make_trainer)
+
+
+def trainer_of(env: Env, config: Config, mesh: Any = None) -> Trainer:
+    """One for an environment, by its identity, and a configuration, but for the number of reports."""
+    return _make_once(env, config.model_copy(update={"num_evals": 1}), mesh)
+
+
 _programs: dict[Any, Any] = {}
 
 

@@ -1,7 +1,6 @@
 """No random number is drawn twice: whatever keys the train loop derives, each is drawn from, split or folded once."""
 
 from collections import Counter
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -83,7 +82,7 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Seen:
 
 
 @pytest.fixture(params=[1, 2], ids=["1 shard", "2 shards"])
-def seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Seen]:
+def seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Seen:
     """Four unrolls with three minibatches each, and three APG updates."""
     config = run_config(
         num_envs=LANES,
@@ -108,7 +107,7 @@ def seen(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
     for step in range(APG_UPDATES):
         state = polish(jnp.int32(step), state)
     jax.effects_barrier()
-    yield seen
+    return seen
 
 
 def test_no_key_is_used_twice(seen: Seen) -> None:
