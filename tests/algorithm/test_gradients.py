@@ -110,7 +110,7 @@ def log_pi(learner: BoundLearner, progress: float, policy: Any, d: Transition) -
     hyper = learner.hyper
     sigma = hyper.sigma ** (1 - progress) * hyper.sigma_end**progress
     z = (d.action - mlp(policy, d.observation * hyper.observation_scale)) / sigma
-    return (-(z**2) / 2 - np.log(sigma * np.sqrt(2 * np.pi))).sum(-1)
+    return (-(z**2) / 2 - jnp.log(sigma * np.sqrt(2 * np.pi))).sum(-1)
 
 
 class Constants(NamedTuple):
