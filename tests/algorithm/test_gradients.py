@@ -15,9 +15,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from bound_learner import BoundLearner
-from qrl.algorithm.learner import LearnerState
+from qrl.algorithm.learner import LearnerState, UpdateMetrics
 from qrl.algorithm.types import Networks, Transition
-from qrl.config import Config, load_preset
+from qrl.config import Config, Hyperparameters, load_preset
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
@@ -28,7 +28,7 @@ CHANGES = {
     "num_timesteps": 64 * 50 * 12,
     "normalize_observations": False,
     "observation_scale": [1.0, 0.5, 2.0, 1.0, 0.7],
-    "policy_hidden_layer_sizes": [6, 6],
+    "policy_hidden_layer_sizes": [6],
     "critic_hidden_layer_sizes": [7],
     "max_grad_norm": 1e9,  # no clip
     "sigma": 0.9,
@@ -37,6 +37,7 @@ CHANGES = {
     "learning_rate_end": 0.001,
     "gamma": 0.9,
 }
+UNNORMALIZED = [("mu", "difference", True), ("pi", "difference", False)]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -50,9 +51,19 @@ def doubles(tree: Any) -> Any:
     return jax.tree.map(lambda x: np.asarray(x, np.float64) if np.asarray(x).dtype.kind == "f" else x, tree)
 
 
-def learner_of(**changes: object) -> BoundLearner:
+def learner_of(advantage: str = "pi", form: str = "ratio", xi: float | None = None, **changes: object) -> BoundLearner:
+    """Two of the eight leave the advantage as it is."""
+    changes |= {"advantage": advantage, "form": form, "xi": xi}
+    changes["normalize_advantage"] = (advantage, form, xi is None) not in UNNORMALIZED
     config = Config.model_validate(load_preset("default") | CHANGES | changes, strict=False)
     return BoundLearner(config, F, A).with_hyper(doubles(config.hyperparameters))
+
+
+@functools.cache
+def update_of(advantage: str, form: str, epsilon: bool) -> Callable[..., tuple[LearnerState, UpdateMetrics]]:
+    """Compiled once for each condition and margin, of any hyperparameters."""
+    learner = learner_of(advantage, form, None if epsilon else 0.02)
+    return jax.jit(lambda hyper, state, data: learner.with_hyper(hyper).update(state, data))
 
 
 # Where trajectories end: in more than one place (V of all that follows is computed anew), in one, at the last step.
@@ -106,8 +117,7 @@ def mlp(params: Any, x: Any) -> Any:
     return x
 
 
-def log_pi(learner: BoundLearner, progress: float, policy: Any, d: Transition) -> Any:
-    hyper = learner.hyper
+def log_pi(hyper: Hyperparameters, progress: float, policy: Any, d: Transition) -> Any:
     sigma = hyper.sigma ** (1 - progress) * hyper.sigma_end**progress
     z = (d.action - mlp(policy, d.observation * hyper.observation_scale)) / sigma
     return (-(z**2) / 2 - jnp.log(sigma * np.sqrt(2 * np.pi))).sum(-1)
@@ -124,7 +134,7 @@ def constants(learner: BoundLearner, progress: float, params: Networks, d: Trans
     scale, horizon = learner.hyper.observation_scale, 1.0 / (1.0 - hyper.gamma)
     low, high = (hyper.reward_scaling * horizon * x for x in (min(d.reward.min(), 0.0), max(d.reward.max(), 0.0)))
     v, v_next = (np.clip(mlp(params.critic, x * scale)[..., 0], low, high) for x in (d.observation, d.next_observation))
-    ratio = np.exp(log_pi(learner, progress, params.policy, d) - d.log_mu)
+    ratio = np.exp(log_pi(learner.hyper, progress, params.policy, d) - d.log_mu)
     off_policy = c.advantage == "pi"
     advantage, target = np.zeros(d.reward.shape), np.zeros(d.reward.shape)
     for b in range(len(d.reward)):
@@ -149,37 +159,41 @@ def constants(learner: BoundLearner, progress: float, params: Networks, d: Trans
     return Constants(advantage, target)
 
 
-@functools.cache
-def surrogate_gradient(learner: BoundLearner) -> Callable[..., tuple[Any, Networks]]:
-    """Compiled: ((sum of losses, each), gradient)."""
-
-    def losses(params: Networks, progress: jax.Array, d: Transition, known: Constants) -> tuple[jax.Array, Networks]:
-        each = surrogate(learner, progress, params, d, known)
-        return each.policy + each.critic, each
-
-    return jax.jit(jax.value_and_grad(losses, has_aux=True))
-
-
-def surrogate(learner: BoundLearner, progress: float, params: Networks, d: Transition, known: Constants) -> Networks:
+def surrogate(
+    form: str, params: Networks, hyper: Hyperparameters, progress: float, d: Transition, known: Constants
+) -> Networks:
     """The policy's loss and the critic's."""
-    c, a = learner.config, known.advantage
-    log_density = log_pi(learner, progress, params.policy, d)
-    gain = jnp.exp(log_density - d.log_mu) - 1 if c.form == "ratio" else jnp.exp(log_density) - jnp.exp(d.log_mu)
-    limit = learner.hyper.epsilon * jnp.abs(a) if c.xi is None else learner.hyper.xi
-    v = mlp(params.critic, d.observation * learner.hyper.observation_scale)[..., 0]
+    a = known.advantage
+    log_density = log_pi(hyper, progress, params.policy, d)
+    gain = jnp.exp(log_density - d.log_mu) - 1 if form == "ratio" else jnp.exp(log_density) - jnp.exp(d.log_mu)
+    limit = hyper.epsilon * jnp.abs(a) if hyper.xi is None else hyper.xi
+    v = mlp(params.critic, d.observation * hyper.observation_scale)[..., 0]
     return Networks(-jnp.mean(jnp.minimum(gain * a, limit)), jnp.mean((v - known.target) ** 2))
 
 
-def assert_literal(learner: BoundLearner, update: Any, data: Transition, critic: float = 1.0) -> float:
+@functools.partial(jax.jit, static_argnums=0)
+def surrogate_gradient(form: str, params: Networks, *given: Any) -> tuple[tuple[jax.Array, Networks], Networks]:
+    """((sum of losses, each), gradient)."""
+
+    def losses(params: Networks) -> tuple[jax.Array, Networks]:
+        each = surrogate(form, params, *given)
+        return each.policy + each.critic, each
+
+    return jax.value_and_grad(losses, has_aux=True)(params)
+
+
+def assert_literal(learner: BoundLearner, data: Transition, critic: float = 1.0) -> float:
     """Losses, gradients of both networks and their step are the surrogate's; the share of samples at their margin."""
     planned = learner.planned_updates
     progress = round(0.25 * planned) / planned
     state = begin(learner, data, progress, critic)
     noise = np.random.default_rng(5).normal(size=data.reward.shape)
-    data = data._replace(log_mu=np.asarray(log_pi(learner, progress, state.params.policy, data)) + 0.4 * noise)
+    data = data._replace(log_mu=np.asarray(log_pi(learner.hyper, progress, state.params.policy, data)) + 0.4 * noise)
     known = constants(learner, progress, state.params, data)
-    (_, each), slope = surrogate_gradient(learner)(state.params, progress, data, known)
-    after, terms = update(state, data)
+    (_, each), slope = surrogate_gradient(learner.config.form, state.params, learner.hyper, progress, data, known)
+    after, terms = update_of(learner.config.advantage, learner.config.form, learner.hyper.xi is None)(
+        learner.hyper, state, data
+    )
     np.testing.assert_allclose((terms.policy_loss, terms.value_loss), each, rtol=1e-9)
     for before, ours, adam, expected in zip(state.params, after.params, after.optimizer, slope, strict=True):
         flat, _ = ravel_pytree(expected)
@@ -189,7 +203,7 @@ def assert_literal(learner: BoundLearner, update: Any, data: Transition, critic:
         rate = learner.config.learning_rate * (1 - progress) + learner.config.learning_rate_end * progress
         step = ravel_pytree(before)[0] - ravel_pytree(ours)[0]
         np.testing.assert_allclose(step, rate * found / (np.abs(found) + 1e-8), rtol=1e-6, atol=1e-12)
-    ratio = np.exp(log_pi(learner, progress, state.params.policy, data) - data.log_mu)
+    ratio = np.exp(log_pi(learner.hyper, progress, state.params.policy, data) - data.log_mu)
     return float(np.mean((ratio - 1) * known.advantage > 0.2 * np.abs(known.advantage)))
 
 
@@ -202,30 +216,20 @@ def test_update_follows_the_literal_gradient(advantage: str, form: str, xi: floa
     So nothing flows through targets, importance weights and advantages. Also with clips, lambda and a critic whose
     values are beyond what the rewards can pay.
     """
-    learner = learner_of(advantage=advantage, form=form, xi=xi)
-    update = jax.jit(lambda hyper, state, data: learner.with_hyper(hyper).update(state, data))
+    learner = learner_of(advantage, form, xi)
     clipped = [
-        assert_literal(learner, lambda *x: update(learner.hyper, *x), batch(where, why, seed))
-        for seed, where in enumerate(WHERE.values())
-        for why in WHY
+        assert_literal(learner, batch(where, why, seed)) for seed, where in enumerate(WHERE.values()) for why in WHY
     ]
     assert 0.1 < np.mean(clipped) < 0.9, "some are clipped, some are not"
-    assert_literal(learner, lambda *x: update(learner.hyper, *x), batch(WHERE["many"], "all"), critic=30.0)
-    other = learner_of(advantage=advantage, form=form, xi=xi, lam=0.8, rho_bar=0.9, c_bar=1.1, reward_scaling=0.5)
-    assert_literal(other, lambda *x: update(other.hyper, *x), batch(WHERE["many"], "all"))
-
-
-@pytest.mark.parametrize("xi", [None, 0.02], ids=["epsilon", "xi"])
-def test_the_advantage_may_be_left_as_it_is(xi: float | None) -> None:
-    learner = learner_of(normalize_advantage=False, xi=xi)
-    assert_literal(learner, jax.jit(learner.update), batch(WHERE["many"], "all"))
+    assert_literal(learner, batch(WHERE["many"], "all"), critic=30.0)
+    other = learner_of(advantage, form, xi, lam=0.8, rho_bar=0.9, c_bar=1.1, reward_scaling=0.5)
+    assert_literal(other, batch(WHERE["many"], "all"))
 
 
 @pytest.mark.parametrize("steps", [1, 2])
 def test_unrolls_may_be_short(steps: int) -> None:
     """Of one step there is none within; of two, one."""
-    learner = learner_of()
-    assert_literal(learner, jax.jit(learner.update), batch(WHERE["one"][:, :steps], "all"))
+    assert_literal(learner_of(), batch(WHERE["one"][:, :steps], "all"))
 
 
 @pytest.mark.parametrize("planned", [1.0, 2.0])
@@ -235,7 +239,7 @@ def test_the_step_size_is_linear_in_the_planned_updates(planned: float) -> None:
     A learning phase that was extended has a schedule of its new length.
     """
     learner, data = learner_of(), batch(WHERE["many"], "all")
-    update = jax.jit(learner.update)
+    update = functools.partial(update_of("pi", "ratio", True), learner.hyper)
     state = begin(learner, data, 0.0)
     state = state._replace(planned_updates=jnp.int32(planned * learner.planned_updates))
     sizes = []
@@ -248,26 +252,18 @@ def test_the_step_size_is_linear_in_the_planned_updates(planned: float) -> None:
 def test_targets_are_within_what_the_rewards_can_pay() -> None:
     """Rewards in [−1, 0] at gamma 0.99: targets in [−100, 0], however large a critic has grown, either way.
 
-    Seen through the loss (V − target)² of critics that are constant, one trajectory at a time.
+    Seen through the loss (V − target)² of critics that are constant.
     """
-    learner = learner_of(gamma=0.99, reward_scaling=1.0, normalize_advantage=False)
+    learner = learner_of(gamma=0.99, reward_scaling=1.0)
     data = batch(WHERE["many"], "all")
     data = data._replace(reward=-np.random.default_rng(3).uniform(size=(B, T)))
     data.reward[0, 0] = -1.0
     state = begin(learner, data, 0.0, critic=0.0)
-    data = data._replace(log_mu=np.asarray(log_pi(learner, 0.0, state.params.policy, data)))
+    data = data._replace(log_mu=np.asarray(log_pi(learner.hyper, 0.0, state.params.policy, data)))
     *_, last = state.params.critic["params"]
-    each = jax.tree.map(lambda x: x[:, None], data)
-
-    @jax.jit
-    def value_loss(v: jax.Array) -> jax.Array:
-        critic = jax.tree.map(jnp.asarray, state.params.critic)
-        critic["params"][last]["bias"] = v[None]
-        now = state._replace(params=state.params._replace(critic=critic))
-        return jax.vmap(lambda one: learner.update(now, one)[1].value_loss)(each)
-
     for v in (-1e6, -300.0, 300.0, 1e6):
-        errors = np.sqrt(value_loss(jnp.float64(v)))  # root mean square over each trajectory
+        state.params.critic["params"][last]["bias"] = np.array([v])
+        _, terms = update_of("pi", "ratio", True)(learner.hyper, state, data)
+        error = np.sqrt(terms.value_loss)  # root mean square
         nearest, farthest = sorted((abs(v), abs(v + 100.0)))
-        assert (nearest - 1e-6 <= errors).all()
-        assert (errors <= farthest + 1e-6).all()
+        assert nearest - 1e-6 <= error <= farthest + 1e-6
