@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
+import small_run
 from fault_injection import assert_same_leaves, leaves
 from qrl.runs import checkpoint, files
 from qrl.training import driver, loop, restore
