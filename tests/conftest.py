@@ -10,6 +10,7 @@ import jax
 import pytest
 from hypothesis import settings
 
+import once
 from cli_helpers import TINY, qrl
 from cross_targets import need
 from qrl.export import targets
@@ -27,8 +28,7 @@ def _compile_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """One for all workers of pytest-xdist. An entry read while another worker writes it fails to decompress, and JAX
     compiles instead.
     """
-    base = tmp_path_factory.getbasetemp()
-    folder = str((base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "xla")
+    folder = str(once.session_folder(tmp_path_factory) / "xla")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = folder  # for the command line, here or in a process of its own
     jax.config.update("jax_compilation_cache_dir", folder)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -163,7 +163,7 @@ def test_wrong_input_gets_one_line(asked: list[Any], tmp_path: Path, given: dict
 
 def test_a_preset_and_a_config_are_refused_together(asked: list[Any]) -> None:
     with pytest.raises(BadInput, match="expected preset or a Config, found both"):
-        qrl.train("pendulum", qrl.Config.preset("pendulum"), preset="pendulum_fast")
+        qrl.train("pendulum", config=qrl.Config.preset("pendulum"), preset="pendulum_fast")
     assert not asked
 
 

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
+import small_run
 from bound_learner import BoundLearner
 from fault_injection import assert_same_leaves, leaves
 from qrl import tasks
@@ -20,15 +21,14 @@ from qrl.algorithm.learner import LearnerState
 from qrl.config import Config, load_preset, preset_names
 from qrl.runs import checkpoint, files
 from qrl.training import driver
-from qrl.training.state import member_inputs, stack
-from qrl.training.trainer import make_trainer
-from qrl_envs import env as worlds
+from qrl.training.state import FAULT_TERMS, MemberInputs, TrainState, stack
+from qrl.training.trainer import Trainer
 from qrl_envs.specfile import BadInput
 from small_run import comparable_metrics, run_config, train
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
-CLIMBING = {
+WITH_APG = {
     "apg_fraction": 0.4,
     "apg_num_envs": 4,
     "apg_episode_length": 20,
@@ -41,13 +41,14 @@ def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Pushed(Env):
-    """A point on a line, pushed; ends beyond `edge`. Reward −x²."""
+    """A point on a line, pushed; ends beyond `edge`, out of bounds where it went left. Reward `constant` − x²."""
 
     observation_size, action_size, backend = 2, 1, "test"  # pyright: ignore[reportAssignmentType]
     episode_steps = 20
 
-    def __init__(self, edge: float = 1e9) -> None:
+    def __init__(self, edge: float = 1e9, constant: float = 0.0) -> None:
         self.edge = edge
+        self.constant = constant
 
     def reset(self, rng: jax.Array) -> State:
         return self._at(jax.random.uniform(rng, (2,), minval=-1.0, maxval=1.0))
@@ -59,61 +60,89 @@ class Pushed(Env):
 
     def _at(self, obs: jax.Array) -> State:
         done = (jnp.abs(obs[0]) > self.edge).astype(jnp.float32)
-        return State(None, obs, -(obs[0] ** 2), done)
+        return State(None, obs, self.constant - obs[0] ** 2, done, info={"out_of_bounds": done * (obs[0] < 0.0)})
 
 
 def linear(gain: jax.Array) -> analytic_gradient.Mean:
     return lambda observation: observation @ gain[:, None]
 
 
-def literal(env: Env, gain: np.ndarray, sigma: float, keys: jax.Array, steps: int) -> np.ndarray:
-    """One flight after the other, step by step."""
-    found = []
-    for key in keys:
-        start, noise = jax.random.split(key)
-        noise = np.asarray(jax.random.normal(noise, (steps, 1)))
-        state, total, ended = env.reset(start), 0.0, False
-        for t in range(steps):
-            action = np.clip(np.asarray(state.obs) @ gain + sigma * noise[t], -1.0, 1.0)
-            state = env.step(state, jnp.asarray(action))
-            total += float(state.reward)
-            ended |= bool(state.done)
-        found.append(0.0 if ended else total)
-    return np.array(found)
+def literal(env: Env, gain: jax.Array, sigma: float, key: jax.Array, steps: int) -> tuple[jax.Array, bool]:
+    """One flight step by step, up to its end; what is left of it is charged at once. Also whether it is complete."""
+    start, noise = jax.random.split(key)
+    noise = jax.random.normal(noise, (steps, 1))
+    state, total = env.reset(start), jnp.zeros(())
+    for t in range(steps):
+        state = env.step(state, jnp.clip(state.obs @ gain[:, None] + sigma * noise[t], -1.0, 1.0))
+        total = total + state.reward
+        if state.done:
+            forever = state.info["out_of_bounds"] > 0 or state.reward < 0
+            return total + (steps - 1 - t) * (state.reward if forever else 0.0), False
+    return total, True
 
 
 KEYS = jax.random.split(jax.random.PRNGKey(3), 6)
+EDGE, SIGMA, STEPS = 1.1, 0.3, 8
 
 
-def test_returns_are_those_of_flights_step_by_step() -> None:
-    """With noise, clipped actions, and flights that end early among them."""
-    env, gain = Pushed(edge=1.5), np.array([-0.5, 0.3], np.float32)
-    expected = literal(env, gain, 0.3, KEYS, 8)
-    assert 0 < (expected == 0.0).sum() < len(KEYS)
-    found, whole = analytic_gradient.returns(env, linear(jnp.asarray(gain)), jnp.float32(0.3), KEYS, 8)
-    np.testing.assert_allclose(found, expected, rtol=1e-5)
-    np.testing.assert_array_equal(whole, expected != 0.0)
+def flights(env: Env, gain: jax.Array, keys: jax.Array = KEYS) -> tuple[jax.Array, jax.Array]:
+    return jax.jit(lambda gain: analytic_gradient.returns(env, linear(gain), jnp.float32(SIGMA), keys, STEPS))(gain)
 
 
-def test_the_gradient_is_that_of_finite_differences() -> None:
-    """Of the mean return in the policy's gain, through environment and noise; ended flights have none."""
-    env, gain, sigma = Pushed(edge=1.5), np.array([-0.3, 0.4]), 0.1
+@pytest.mark.parametrize("constant", [0.0, 5.0])
+def test_returns_are_those_of_flights_step_by_step(constant: float) -> None:
+    """With noise, clipped actions, and flights that end early among them: their last reward goes on to the last step,
+    but where it is above 0 and the flight was within the bounds.
+    """
+    env, gain = Pushed(EDGE, constant), jnp.array([-0.1, 0.3])
+    expected = [literal(env, gain, SIGMA, key, STEPS) for key in KEYS]
+    found, complete = flights(env, gain)
+    np.testing.assert_allclose(found, [float(total) for total, _ in expected], rtol=1e-5)
+    assert complete.tolist() == [whole for _, whole in expected]
+    assert 2 <= sum(complete) <= len(KEYS) - 2
+    sides = {float(env_end(env, gain, key)) for key in KEYS} - {0.0}
+    assert sides == {-1.0, 1.0}, "some end out of bounds, some terminate"
 
-    def mean_return(gain: jax.Array) -> jax.Array:
-        return jnp.mean(analytic_gradient.returns(env, linear(gain), jnp.float32(sigma), KEYS, 8)[0])
 
-    step = 1e-2
-    expected = [
-        (
-            float(mean_return(jnp.asarray(gain + d, jnp.float32)))
-            - float(mean_return(jnp.asarray(gain - d, jnp.float32)))
-        )
-        / (2 * step)
-        for d in step * np.eye(2)
-    ]
-    np.testing.assert_allclose(jax.grad(mean_return)(jnp.asarray(gain, jnp.float32)), expected, rtol=2e-2)
-    outward = jnp.array([50.0, 50.0])  # every flight ends
-    np.testing.assert_array_equal(jax.grad(mean_return)(outward), 0.0)
+def env_end(env: Env, gain: jax.Array, key: jax.Array) -> float:
+    """The side on which the flight ends; 0: it does not."""
+    start, noise = jax.random.split(key)
+    noise = jax.random.normal(noise, (STEPS, 1))
+    state = env.reset(start)
+    for t in range(STEPS):
+        state = env.step(state, jnp.clip(state.obs @ gain[:, None] + SIGMA * noise[t], -1.0, 1.0))
+        if state.done:
+            return float(jnp.sign(state.obs[0]))
+    return 0.0
+
+
+def mean_slope(env: Env, gain: jax.Array, keys: jax.Array = KEYS) -> jax.Array:
+    return jax.grad(lambda gain: jnp.mean(flights(env, gain, keys)[0]))(gain)
+
+
+@pytest.mark.parametrize("constant", [0.0, 5.0])
+def test_every_flight_has_its_share_of_the_gradient(constant: float) -> None:
+    """Also one that ends: up to its end, and through the charge for what is left."""
+    env, gain = Pushed(EDGE, constant), jnp.array([-0.1, 0.3])
+    each = [jax.grad(lambda gain, key=key: literal(env, gain, SIGMA, key, STEPS)[0])(gain) for key in KEYS]
+    assert all(np.abs(slope).min() > 0.0 for slope in each)
+    np.testing.assert_allclose(mean_slope(env, gain), np.mean(each, axis=0), rtol=1e-4)
+
+
+class Bursting(Pushed):
+    """Beyond the edge it runs away so fast that it overflows in a few steps."""
+
+    def step(self, state: State, action: jax.Array) -> State:
+        burst = jnp.where(jnp.abs(state.obs) > self.edge, 1e9 * state.obs**5, state.obs)
+        return super().step(state.replace(obs=burst), action)
+
+
+def test_a_flight_that_would_overflow_spoils_no_other() -> None:
+    """It is held where it ended: the gradient is finite, and that of the flights each for its share."""
+    gain = jnp.array([-0.1, 0.3])
+    state = Bursting(EDGE).step(State(None, jnp.full(2, 2.0), jnp.zeros(()), jnp.zeros(())), jnp.zeros(1))
+    assert not np.isfinite(Bursting(EDGE).step(state, jnp.zeros(1)).reward)
+    np.testing.assert_array_equal(mean_slope(Bursting(EDGE), gain), mean_slope(Pushed(EDGE), gain))
 
 
 def learner(**changes: object) -> BoundLearner:
@@ -129,19 +158,19 @@ def policy_of(state: LearnerState) -> np.ndarray:
     return np.concatenate([np.ravel(x) for x in jax.tree.leaves(state.params.policy)])
 
 
-def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
-    """Thirty steps on the pushed point; the critic and its optimiser stay."""
+def test_updates_raise_the_return_and_move_the_policy_alone() -> None:
+    """Thirty steps on the pushed point; the critic and its optimizer stay."""
     env, ours = Pushed(), learner(apg_learning_rate=0.01)
     keys = jax.random.split(jax.random.PRNGKey(0), 32)
 
     def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
         return analytic_gradient.returns(env, lambda o: ours.mean(now, o), jnp.float32(0.0), keys, 20)
 
-    climb = jax.jit(lambda now, i: ours.apg_update(now, flown, i))
+    update = jax.jit(lambda now, i: ours.apg_update(now, flown, i, ours.config.num_apg_updates))
     state = first = ours.init(jax.random.PRNGKey(1))
-    for i in range(29):
-        state, _, _ = climb(state, i)
-    state, _, sums = climb(state, 29)
+    for i in range(30):
+        state, _, sums, skipped = update(state, i)
+        assert not skipped
     assert float(jnp.mean(flown(state)[0])) > 0.5 * float(jnp.mean(flown(first)[0]))  # both below 0
     assert sums[1] == ours.config.apg_num_envs
     assert state.updates == 30
@@ -150,26 +179,28 @@ def test_climbs_raise_the_return_and_move_the_policy_alone() -> None:
     jax.tree.map(np.testing.assert_array_equal, state.average, state.params.policy)
 
 
-def test_the_first_climb_begins_with_what_ships_and_a_fresh_optimiser() -> None:
-    """Adam's first step is the sign of the gradient, whatever it had seen before; the last one's size is near 0."""
+def test_the_first_update_begins_with_the_deployed_policy_and_a_new_optimizer() -> None:
+    """Adam's first step is the sign of the gradient, whatever it had seen before; its size decays as 1.5th power."""
     ours = learner(average_fraction=0.5, max_grad_norm=1e9)
     state = ours.init(jax.random.PRNGKey(1))
     seen = jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimizer.policy)
     average = jax.tree.map(lambda x: x + 1.0, state.params.policy)
     state = state._replace(
-        optimizer=state.optimizer._replace(policy=seen), average=average, updates=jnp.int32(ours.total_updates)
+        optimizer=state.optimizer._replace(policy=seen), average=average, updates=jnp.int32(ours.planned_updates)
     )
 
     def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
         return sum(jnp.sum(3.0 * x) for x in jax.tree.leaves(now.params.policy))[None], jnp.ones(1)
 
-    after, terms, _ = ours.apg_update(state, flown, jnp.int32(0))
+    planned = jnp.int32(300)
+    after, terms, _, _ = ours.apg_update(state, flown, jnp.int32(0), planned)
     ships = policy_of(state._replace(params=state.params._replace(policy=average)))
     np.testing.assert_allclose(policy_of(after) - ships, ours.config.apg_learning_rate, rtol=1e-3)
     np.testing.assert_allclose(terms.policy_gradient, 3.0 * np.sqrt(len(ships)), rtol=1e-5)
-    last, _, _ = ours.apg_update(after, flown, jnp.int32(ours.config.num_apg_updates - 1))
-    expected = ours.config.apg_learning_rate * ours.config.num_apg_updates**-1.5
-    np.testing.assert_allclose(policy_of(last) - policy_of(after), expected, rtol=0.05, atol=1e-7)
+    for step, share in ((75, 0.75), (150, 0.5), (299, 1 / 300)):
+        later, *_ = ours.apg_update(after, flown, jnp.int32(step), planned)
+        expected = ours.config.apg_learning_rate * share**1.5
+        np.testing.assert_allclose(policy_of(later) - policy_of(after), expected, rtol=0.05, atol=3e-7)
 
 
 def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
@@ -181,7 +212,8 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
         return jnp.stack(slopes), jnp.ones(1)
 
     state = state._replace(optimizer=jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimizer))  # a momentum
-    after, terms, _ = ours.apg_update(state, flown, jnp.int32(1))
+    after, terms, _, skipped = ours.apg_update(state, flown, jnp.int32(1), jnp.int32(9))
+    assert skipped
     np.testing.assert_array_equal(policy_of(after), policy_of(state))
     jax.tree.map(np.testing.assert_array_equal, after.optimizer, state.optimizer)
     assert terms.policy_gradient == 0.0
@@ -194,10 +226,10 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
     apg_num_envs=st.sampled_from([8, 40, 64]),
     apg_episode_length=st.integers(1, 600),
 )
-def test_a_run_is_learning_and_then_climbs(
+def test_a_run_is_learning_and_then_apg(
     steps: int, lanes: int, fraction: float, apg_num_envs: int, apg_episode_length: int
 ) -> None:
-    """Together they make its unrolls; climbs take no more than their share, and no fewer steps than they fly."""
+    """Together they make its unrolls; APG takes no more than its share, and no fewer steps than it flies."""
     changes = {
         "apg_fraction": fraction,
         "apg_num_envs": apg_num_envs,
@@ -206,10 +238,10 @@ def test_a_run_is_learning_and_then_climbs(
     }
     base = load_preset("default") | {"num_timesteps": steps, "num_envs": lanes, "unroll_length": 5, "batch_size": 8}
     ours = Config.model_validate(base | changes, strict=False)
-    climbing = ours.num_unrolls - ours.learning_unrolls
-    assert climbing == ours.num_apg_updates * ours.unrolls_per_apg_update <= fraction * ours.num_unrolls
+    polishing = ours.num_unrolls - ours.learning_unrolls
+    assert polishing == ours.num_apg_updates * ours.unrolls_per_apg_update <= fraction * ours.num_unrolls
     assert ours.unrolls_per_apg_update * ours.steps_per_unroll >= apg_num_envs * apg_episode_length
-    assert climbing + ours.unrolls_per_apg_update > fraction * ours.num_unrolls - 1
+    assert polishing + ours.unrolls_per_apg_update > fraction * ours.num_unrolls - 1
 
 
 @pytest.mark.parametrize(
@@ -222,63 +254,143 @@ def test_a_run_is_learning_and_then_climbs(
 )
 def test_what_cannot_be_is_said(changes: dict[str, object], says: str) -> None:
     with pytest.raises(ValidationError, match=says):
-        run_config(**CLIMBING | changes)
+        run_config(**WITH_APG | changes)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole")
-    train(out, run_config(**CLIMBING), worlds.make("pendulum"))
+    train(out, run_config(**WITH_APG), small_run.pendulum())
     return out
 
 
-def test_a_run_ends_with_its_climbs(whole: Path) -> None:
+def test_a_run_ends_with_its_apg_updates(whole: Path) -> None:
     """Each is an update, and stands for two unrolls of steps; what only minibatches have is 0."""
-    run = run_config(**CLIMBING).learner
+    run = run_config(**WITH_APG).learner
     assert (run.learning_unrolls, run.num_apg_updates) == (18, 6)
     rows = files.read_metrics(whole)
-    assert [row["env_steps"] for row in rows] == [200, 400, 600, 800, 1040, 1200]  # not within a climb
+    assert [row["env_steps"] for row in rows] == [200, 400, 600, 800, 1040, 1200]  # not within an APG update
     assert [row["updates"] for row in rows[-3:]] == [34 + 1, 34 + 4, 34 + 6]
     assert rows[-1]["value_loss"] == 0.0 < rows[-1]["policy_gradient"]
 
 
-def test_reports_among_the_climbs_wait_for_one(tmp_path: Path) -> None:
-    """Asked for oftener than there are climbs: no row is without numbers, and none without a climb."""
-    train(tmp_path, run_config(**CLIMBING, num_evals=30), worlds.make("pendulum"))
+def test_reports_during_apg_wait_for_an_update(tmp_path: Path) -> None:
+    """Asked for oftener than there are updates: no row is without numbers, and none without an update."""
+    train(tmp_path, run_config(**WITH_APG, num_evals=30), small_run.pendulum())
     rows = files.read_metrics(tmp_path)
     assert [row["env_steps"] for row in rows] == [*range(40, 721, 40), *range(800, 1201, 80)]
     assert all(np.isfinite([row["reward_mean"], row["steps_per_second"]]).all() for row in rows)
     assert [row["updates"] for row in rows[-6:]] == [34 + i for i in range(1, 7)]
 
 
-class Fleeing(Pushed):
-    """Every flight ends at once."""
+class Odd(Pushed):
+    """Its flights, rewards or gradients fail, as its parameters say: one environment, whose programs fit all."""
 
     def __init__(self) -> None:
-        super().__init__(edge=0.0)
+        super().__init__()
+        self.params = self.but()
 
+    @staticmethod
+    def but(edge: float = 1e9, nan: float = 0.0, sharp: float = 0.0) -> dict[str, jax.Array]:
+        """Where flights end; whether rewards are no numbers; whether the rewards' gradients are none."""
+        return {"edge": jnp.float32(edge), "nan": jnp.float32(nan), "sharp": jnp.float32(sharp)}
 
-def test_flights_that_end_early_are_counted(tmp_path: Path) -> None:
-    """And are no part of the mean reward, which would be at its best."""
-    train(tmp_path, run_config(**CLIMBING), Fleeing())
-    assert [row["ended_early"] for row in files.read_metrics(tmp_path)[-2:]] == [1.0, 1.0]
+    def with_params(self, params: dict[str, jax.Array]) -> "Odd":
+        other = Odd()
+        other.params = params
+        return other
 
+    def reset(self, rng: jax.Array) -> State:
+        return super().reset(rng).replace(pipeline_state=self.params)
 
-class Nowhere(Pushed):
-    """Its rewards are not numbers once it is flown for a while."""
+    def restart(self, state: State, rng: jax.Array) -> State:
+        return self.with_params(state.pipeline_state).reset(rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        return super().step(state, action).replace(reward=jnp.where(jnp.abs(state.obs[0]) > 0.0, jnp.nan, 0.0))
+        params, after = state.pipeline_state, super().step(state, action)
+        zero = jnp.where(params["sharp"] > 0, after.obs[0] - after.obs[0], 1.0)
+        spoiled = jnp.where(params["nan"] > 0, jnp.nan, after.reward) - params["sharp"] * jnp.sqrt(zero)
+        done = (jnp.abs(after.obs[0]) > params["edge"]).astype(jnp.float32)
+        return after.replace(pipeline_state=params, reward=spoiled, done=done, info={"out_of_bounds": done})
 
 
-def test_rewards_that_are_no_numbers_stop_the_climbs() -> None:
+ODD = Odd()
+MANY_UPDATES = run_config(**WITH_APG | {"num_timesteps": 4800, "num_evals": 5})
+
+
+def at_apg(**odd: float) -> tuple[Trainer, MemberInputs, TrainState]:
+    """A trainer and a state at the end of learning, without having learned."""
+    config = MANY_UPDATES.learner
+    assert config.num_apg_updates == 24
+    trainer = small_run.trainer_of(ODD, config)
+    inputs = stack([MemberInputs(config.hyperparameters, jax.tree.map(np.asarray, Odd.but(**odd)))])
+    states = trainer.init(driver.seeds(0, 1), inputs)
+    return trainer, inputs, states._replace(unrolls=jnp.full(1, config.learning_unrolls, jnp.int32))
+
+
+def after(updates: int, trainer: Trainer, inputs: MemberInputs, states: TrainState) -> TrainState:
+    until = int(states.unrolls[0]) + updates * trainer.config.unrolls_per_apg_update
+    return trainer.apg(states, inputs, np.int32(until))
+
+
+def test_flights_that_end_early_are_counted() -> None:
+    """And are charged in the mean reward, so that it is not at its best."""
+    totals = after(2, *at_apg(edge=0.0)).totals
+    assert (totals.episodes, totals.early, totals.steps) == (8, 8, 2 * 4 * 20)
+    assert totals.rewards / totals.steps < -0.1
+
+
+def test_rewards_that_are_no_numbers_stop_apg() -> None:
     """The fault is the run's, as it is while it learns."""
-    config = run_config(**CLIMBING).learner
-    trainer, points = make_trainer(Nowhere(), config), stack([member_inputs(Nowhere(), config)])
-    states = trainer.init(driver.seeds(0, 1), points)
-    states = states._replace(unrolls=jnp.full(1, config.learning_unrolls, jnp.int32))
-    after = trainer.apg(states, points, np.int32(config.num_unrolls))
-    assert (after.fault_update, after.fault_term) == (0, 0)
+    stopped = after(2, *at_apg(nan=1.0))
+    assert (stopped.fault_update, FAULT_TERMS[int(stopped.fault_term[0])]) == (0, "reward")
+
+
+def test_skipped_updates_are_counted_and_twenty_in_a_row_are_a_fault() -> None:
+    """They are not in a row where one in between is not skipped."""
+    trainer, inputs, states = at_apg(sharp=1.0)
+    kind = at_apg()[1]
+
+    def seen(states: TrainState) -> tuple[int, int, int]:
+        return int(states.totals.skipped[0]), int(states.skipped_in_a_row[0]), int(states.fault_update[0])
+
+    states = after(15, trainer, inputs, states)
+    assert seen(states) == (15, 15, -1)
+    states = after(1, trainer, kind, states)
+    assert seen(states) == (15, 0, -1)
+    states = after(8, trainer, inputs, states)
+    assert seen(states) == (23, 8, -1)
+    states = states._replace(skipped_in_a_row=jnp.full(1, 18, jnp.int32), unrolls=states.unrolls - 8)
+    states = after(1, trainer, inputs, states)
+    assert seen(states) == (24, 19, -1)
+    states = after(1, trainer, inputs, states)
+    assert seen(states) == (25, 20, 25)
+    assert FAULT_TERMS[int(states.fault_term[0])] == "policy_gradient"
+
+
+def test_a_run_whose_updates_are_skipped_on_and_on_is_at_fault() -> None:
+    """The fault names the gradient; the rows before have the number of skipped ones."""
+    trainer, inputs, states = at_apg(sharp=1.0)
+    programs = driver.Programs(trainer.train, lambda: trainer.apg, trainer.fly, trainer.gather)
+    config = MANY_UPDATES.learner
+    made = list(driver.run_chunks(states, inputs, programs, config, driver.Clock(), lambda: False))
+    rows = [row for chunk in made for row in chunk.rows]
+    assert [row["apg_skipped"] for row in rows] == [12.0, 12.0]
+    first = next(i for i, chunk in enumerate(made) if any(chunk.faults))
+    unrolls = made[first].env_steps // config.steps_per_unroll - config.learning_unrolls
+    assert 20 <= unrolls // config.unrolls_per_apg_update <= 22
+    assert made[first].faults == ["policy_gradient is not finite in update 19"]
+
+
+def test_every_update_flies_starts_of_its_own() -> None:
+    """The policy hardly moves: yet each has another mean return."""
+    trainer, inputs, states = at_apg()
+    slow = inputs._replace(hyper=inputs.hyper._replace(apg_learning_rate=np.full(1, 1e-30, np.float32)))
+    found = []
+    for _ in range(4):
+        states = after(1, trainer, slow, states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals)))
+        found.append(float(states.totals.rewards[0]))
+    assert len(set(found)) == 4
 
 
 class Looping(Pushed):
@@ -290,16 +402,16 @@ class Looping(Pushed):
 
 
 def test_an_environment_without_a_gradient_is_told_before_training() -> None:
-    """One line that names the key; without climbs it is welcome."""
+    """One line that names the key; without APG it is welcome."""
     with pytest.raises(BadInput, match="inverted: key 'apg_fraction': expected 0"):
-        tasks.check(Looping(), run_config(**CLIMBING).learner, "inverted")
+        tasks.check(Looping(), run_config(**WITH_APG).learner, "inverted")
     tasks.check(Looping(), run_config().learner, "inverted")
-    tasks.check(Pushed(), run_config(**CLIMBING).learner, "inverted")
+    tasks.check(Pushed(), run_config(**WITH_APG).learner, "inverted")
 
 
 @pytest.mark.parametrize("stop_after", [21, 22])
-def test_stopped_among_the_climbs_it_goes_on_to_the_same_bits(tmp_path: Path, whole: Path, stop_after: int) -> None:
-    env, run = worlds.make("pendulum"), run_config(**CLIMBING)
+def test_stopped_during_apg_it_goes_on_to_the_same_bits(tmp_path: Path, whole: Path, stop_after: int) -> None:
+    env, run = small_run.pendulum(), run_config(**WITH_APG)
     train(tmp_path, run, env, stop_after=stop_after)
     reached = checkpoint.saved_steps(tmp_path)[0]
     assert 720 < reached < 1200
@@ -308,25 +420,7 @@ def test_stopped_among_the_climbs_it_goes_on_to_the_same_bits(tmp_path: Path, wh
     assert comparable_metrics(tmp_path) == comparable_metrics(whole)
 
 
-def test_members_do_not_mix(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Vmapped beside another, a seed's climbs are its own."""
-    env, config = worlds.make("pendulum"), run_config(**CLIMBING).learner
-    trainer = make_trainer(env, config)
-    learning, all_of_it = np.int32(config.learning_unrolls), np.int32(config.num_unrolls)
-
-    def climbed(count: int) -> list[np.ndarray]:
-        points = stack([member_inputs(env, config)] * count)
-        states = trainer.train(trainer.init(driver.seeds(0, count), points), points, learning)
-        return [np.asarray(x)[:1] for x in jax.tree.leaves(trainer.apg(states, points, all_of_it).learner.params)]
-
-    one = climbed(1)
-    monkeypatch.setattr("qrl.training.sharding.sequential_members", lambda count: count == 1)
-    trainer = make_trainer(env, config)
-    for ours, theirs in zip(climbed(2), one, strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-4)
-
-
-def test_presets_that_climb_say_so_in_whole_unrolls() -> None:
+def test_presets_with_apg_say_so_in_whole_unrolls() -> None:
     """What ships: the flights fit the steps that they are counted as."""
     for name in preset_names():
         config = Config.model_validate_json(json.dumps(load_preset("default") | load_preset(name)))

@@ -141,6 +141,19 @@ def test_gradient_vanishes_beyond_the_margin_and_only_there(
         assert float(gradient) == pytest.approx(weight * advantage, rel=1e-12)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(("sign", "slope_at"), [(-1.0, math.exp), (1.0, lambda _: 0.0)], ids=["A < 0", "A > 0"])
+@pytest.mark.parametrize("log_ratio", [19.0, 20.5, 50.0, 200.0, 1e4])
+def test_far_too_likely_bad_actions_teach_the_most(
+    log_ratio: float, sign: float, slope_at: Callable[[float], float], dtype: type
+) -> None:
+    """Beyond a log ratio of 20, where the exponential is held: for A < 0 its gradient stays, finite in float32."""
+    a = dtype(0.3 * sign)
+    found = slope(dtype(log_ratio), dtype(0.0), a, form="ratio")
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, slope_at(min(log_ratio, 20.0)) * a, rtol=1e-5)
+
+
 @each_margin
 @each_form
 @given(log_mu=logs, advantage=advantages)

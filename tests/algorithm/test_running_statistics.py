@@ -1,4 +1,4 @@
-"""Running statistics against NumPy's over everything at once, and Brax's normaliser."""
+"""Running statistics against NumPy's over everything at once, and Brax's normalizer."""
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ def batches(sizes: list[int], offset: float = 3.0) -> list[np.ndarray]:
     return [offset * i + (1 + i) * random.normal(size=(n, F)).astype(np.float32) for i, n in enumerate(sizes)]
 
 
-@given(st.lists(st.integers(1, 40), min_size=1, max_size=6))
+@given(st.lists(st.sampled_from([1, 2, 7, 40]), min_size=1, max_size=6))
 def test_batch_by_batch_is_all_at_once(sizes: list[int]) -> None:
     """However the observations are parted; Brax's, by sums of squares, agrees."""
     parts = batches(sizes)

@@ -302,6 +302,24 @@ def test_a_number_that_is_not_finite_ends_the_episode(hover: World) -> None:
     ends(hover.step(hover.start.replace(pipeline_state=lane), action), [0, 1, 2, 3, 4])
 
 
+def test_whatever_bound_is_left_costs_the_same(any_world: World) -> None:
+    """The reward at 20 m above the origin, upside down, under full action; less than nearer ones. No NaN spoils it."""
+    if any_world.name == "pendulum":
+        pytest.skip("it has no bounds")
+    spec, rate = any_world.env.task.reward, np.zeros((LANES, 3))
+    position = np.array([[20.1, 0, 0], [0, 0, -25.0], [0.1, 0, 0], [0, 0, 0], [0, 0.5, 0], [np.nan, 0, 0]])
+    rate[2:4, :] = [[101.0, 0, 0], [0, 0, -150.0]]
+    after = any_world.step(placed(any_world.start, position_m=position, body_rate_rad_s=rate), jnp.zeros((LANES, 4)))
+    ends(after, [0, 1, 2, 3, 5])
+    if any_world.name == "hover":
+        expected = -(spec.w1_attitude * np.sqrt(2.0) + spec.w2_position_1_m * 20.0 + spec.w3_action * 2.0)
+    else:
+        distance, chi = np.hypot(20.0, spec.radius_m), spec.radius_m * spec.speed_m_s
+        expected = -(spec.w4_distance_1_m * distance + spec.w5_direction_s_m2 * chi + spec.w6_action * 2.0)
+    np.testing.assert_allclose(after.reward[np.array([0, 1, 2, 3, 5])], expected, rtol=1e-5)
+    assert after.reward[4] > expected / 5
+
+
 def test_the_bounds_travel_with_the_lane(hover: World) -> None:
     """A lane with a bound of its own ends at that."""
     lane: Lane = hover.start.pipeline_state

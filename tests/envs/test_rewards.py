@@ -1,6 +1,7 @@
 """The rewards of hover and circle against the paper's formulas (Sec. 5) written out in NumPy, in float64."""
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -121,6 +122,33 @@ def test_circle_reward_is_blind_to_a_turn_about_z(states: tuple[Body, Array]) ->
     turned = Body(Pose(yaw.apply(p), turned_q), Twist(yaw.apply(v), rate))
     for w in (weights("circle", "training"), WEIGHTS["circle"]):
         np.testing.assert_allclose(ours("circle", w, turned, states[1]), ours("circle", w, *states), atol=1e-12)
+
+
+AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("position", [[0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [0.0, -1.5, 0.0], [0.0, 0.0, 2.0]])
+@each_form
+def test_gradients_at_the_goal_are_finite(form: str, position: list[float], dtype: type) -> None:
+    """Where a norm is 0: no action, the point itself, upright, on the circle, on its axis; in what trains and here."""
+    kind: Any = {"hover": rewards.Hover, "circle": rewards.Circle}[form]
+    reward = kind(*(dtype(WEIGHTS[form][field]) for field in kind._fields))
+
+    def value(p: Array, q: Array, v: Array, action: Array) -> jax.Array:
+        return reward(Body(Pose(p, q), Twist(v, jnp.zeros_like(v))), action)
+
+    velocity = np.array([0.0, 2.5, 0.0]) if position[0] else np.zeros(3)  # chi is 0 there
+    at = [x.astype(dtype) for x in (np.array(position), AT_REST, velocity, np.zeros(4))]
+    slopes = jax.jit(jax.grad(value, argnums=(0, 1, 2, 3)))(*at)
+    for slope in slopes:
+        assert slope.dtype == dtype
+        assert np.isfinite(slope).all()
+    np.testing.assert_array_equal(slopes[3], 0.0)
+    weight = WEIGHTS[form]["w2_position_1_m" if form == "hover" else "w4_distance_1_m"]
+    away = np.linalg.norm(position) > 0 if form == "hover" else position[:2] == [0.0, 0.0] and position[2] > 0
+    if form == "hover":
+        np.testing.assert_allclose(slopes[0], -weight * np.sign(position) * away, rtol=1e-6)
 
 
 @each_form

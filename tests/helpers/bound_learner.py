@@ -12,7 +12,7 @@ class BoundLearner:
     def __init__(self, config: Config, observation_size: int, action_size: int, axis: str | None = None) -> None:
         self.config = config
         self.spec = LearnerSpec(config, observation_size, action_size, axis)
-        self.total_updates = self.spec.total_updates
+        self.planned_updates = config.planned_updates(config.learning_unrolls)
         self.policy, self.critic = self.spec.policy, self.spec.critic
         self._bind(config.hyperparameters)
 
@@ -27,7 +27,8 @@ class BoundLearner:
 
         self.hyper = hyper
         self.init, self.update, self.loss = bound(learner.init), bound(learner.update), bound(learner._loss)
-        self.mean, self.sigma, self.preprocess = map(bound, (learner.policy_mean, learner.sigma, learner.preprocess))
+        self.mean, self.preprocess = bound(learner.policy_mean), bound(learner.preprocess)
+        self.sigma = partial(learner.sigma, hyper)
         self.deployed = partial(learner.deployed, self.spec)
         self.update_statistics = partial(learner.update_statistics, self.spec)
         self.apg_update = bound(analytic_gradient.update)

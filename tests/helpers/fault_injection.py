@@ -19,6 +19,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+import once
 from qrl.runs import checkpoint
 from qrl.runs.integrity import MANIFEST
 
@@ -128,14 +129,7 @@ def digest(folder: Path) -> dict[str, str]:
 
 def whole_run(factory: pytest.TempPathFactory) -> Path:
     """A run never stopped, once for all tests."""
-    if not _whole:
-        out = factory.mktemp("whole") / "run"
-        done(qrl(*TRAIN, "--out", out))
-        _whole.append(out)
-    return _whole[0]
-
-
-_whole: list[Path] = []
+    return once.made_once(factory, "whole run", lambda out: done(qrl(*TRAIN, "--out", out / "run"))) / "run"
 
 
 def unfinished(whole: Path, to: Path, env_steps: int) -> Path:

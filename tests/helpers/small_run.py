@@ -1,14 +1,21 @@
 """A run of a second or two, in this process."""
 
 import csv
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+from unittest import mock
 
+import jax
 from brax.envs.base import Env
 
 from qrl.config import Config, load_preset
 from qrl.runs import record
 from qrl.runs.record import RunConfig, TaskRecord
-from qrl.training import loop
+from qrl.training import driver, loop
+from qrl.training.trainer import Trainer, make_trainer
+from qrl_envs import env as worlds
 
 SMALL = {
     "num_timesteps": 1200,
@@ -33,10 +40,42 @@ def run_config(seed: int = 0, seeds: int = 1, **changes: object) -> RunConfig:
     )
 
 
+@functools.cache
+def pendulum() -> Env:
+    """One for all runs of a session, for its programs are compiled once."""
+    return worlds.make("pendulum")
+
+
+_make_once = functools.cache(make_trainer)
+
+
+def trainer_of(env: Env, config: Config, mesh: Any = None) -> Trainer:
+    """One for an environment, by its identity, and a configuration, but for the number of reports."""
+    return _make_once(env, config.model_copy(update={"num_evals": 1}), mesh)
+
+
+_programs: dict[Any, Any] = {}
+
+
+def _compiled_once(compile_program: Callable[..., Any]) -> Callable[..., Any]:
+    def program(trainer: Trainer, states: Any, inputs: Any) -> Any:
+        key = compile_program, trainer, len(states.unrolls), jax.config.read("jax_disable_most_optimizations")
+        if key not in _programs:
+            _programs[key] = compile_program(trainer, states, inputs)
+        return _programs[key]
+
+    return program
+
+
+COMPILED_ONCE = {
+    name: _compiled_once(getattr(driver, name)) for name in ("compile_train", "compile_apg", "compile_fly")
+}
+
+
 def train(
     out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_after: int | None = None
 ) -> list[loop.Event]:
-    """Run to the end, or until `stop_after` events beyond compilation."""
+    """Run to the end, or until `stop_after` events beyond compilation; runs of one environment share their programs."""
     for folder in record.member_folders(out, run):
         folder.mkdir(parents=True, exist_ok=True)
     seen: list[loop.Event] = []
@@ -46,8 +85,9 @@ def train(
             stop_after is not None and sum(not isinstance(e, loop.Compiling | loop.Resumed) for e in seen) >= stop_after
         )
 
-    for event in loop.train(env, run, out, resume=resume, stopped=stopped):
-        seen.append(event)
+    with mock.patch.object(loop, "make_trainer", trainer_of), mock.patch.multiple(driver, **COMPILED_ONCE):
+        for event in loop.train(env, run, out, resume=resume, stopped=stopped):
+            seen.append(event)
     return seen
 
 

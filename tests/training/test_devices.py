@@ -133,9 +133,14 @@ def test_a_run_has_the_devices_that_it_had(tmp_path: Path) -> None:
     """Where a command of its own would make one: as it goes on, and as its config.json repeats it."""
 
     def began(*words: str | Path, **environment: str) -> str:
-        ended = fault_injection.qrl("train", *words, **environment)
-        fault_injection.done(ended)
-        return next(line for line in ended.out.splitlines() if " cpu device" in line)
+        """What it says before it compiles. It is not run to its end."""
+        process = fault_injection.start("train", *words, **environment)
+        try:
+            assert process.stdout
+            return next(line for line in process.stdout if " cpu device" in line)
+        finally:
+            process.kill()
+            process.communicate()
 
     first, again = tmp_path / "first", tmp_path / "again"
     assert "on 2 cpu devices" in began("pendulum", *TINY.split(), "--out", first, JAX_NUM_CPU_DEVICES="2")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from brax.envs.base import Env, State
 
+import small_run
 from fault_injection import assert_same_leaves, leaves
 from qrl.runs import checkpoint, files
 from qrl.training import driver, loop, restore, sharding
@@ -24,7 +25,7 @@ def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def pendulum() -> Env:
-    return worlds.make("pendulum")
+    return small_run.pendulum()
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, who
 @pytest.mark.parametrize("task", ["pendulum", "circle"])
 def test_the_same_seed_gives_the_same_bits_twice(tmp_path: Path, task: str) -> None:
     """State, ring, lanes and metrics."""
-    env, run = worlds.make(task), run_config(num_timesteps=400)
+    env, run = worlds.make(task), run_config(num_timesteps=400, num_evals=2)
     for name in ("first", "again"):
         train(tmp_path / name, run, env)
     assert_same_leaves(leaves(tmp_path / "first"), leaves(tmp_path / "again"))
