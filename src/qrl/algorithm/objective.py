@@ -29,7 +29,7 @@ def dominance(log_pi: chex.Array, log_mu: chex.Array, advantage: chex.Array, for
     if form == "ratio":
         log_ratio = log_pi - log_mu
         # The clamp passes the gradient on: the samples that pi makes far too likely are those that must teach.
-        clamped = jnp.minimum(log_ratio, MAX_LOG_RATIO) + (log_ratio - jax.lax.stop_gradient(log_ratio))
+        clamped = log_ratio + jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO) - log_ratio)
         return jnp.expm1(clamped) * advantage
     return (jnp.exp(log_pi) - jnp.exp(log_mu)) * advantage
 
