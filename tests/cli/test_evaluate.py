@@ -116,6 +116,25 @@ def test_return_counts_to_the_end_of_the_episode(plain: Flights) -> None:
     np.testing.assert_array_equal(plain.returns, last * (last + 1) / 2)
 
 
+class OutOfBounds(Counter):
+    """Ends out of bounds, where another environment terminates."""
+
+    def reset(self, rng: jax.Array) -> State:
+        return super().reset(rng).replace(info={"out_of_bounds": jnp.float32(0.0)})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        after = super().step(state, action)
+        return after.replace(info={**after.info, "out_of_bounds": after.done})
+
+
+def test_out_of_bounds_the_last_reward_goes_on() -> None:
+    """To the last step that pays; and a flight that an end cut short is not complete."""
+    flights = jax.tree.map(np.asarray, evaluate.fly(OutOfBounds(), mean, keys(), LONGEST))
+    last = np.minimum(lives(flights), LONGEST)
+    np.testing.assert_array_equal(flights.returns, last * (last + 1) / 2 + (LONGEST - last) * last)
+    np.testing.assert_array_equal(flights.complete, lives(flights) >= LONGEST)
+
+
 def test_return_counts_the_first_return_steps_alone(judged: Flights) -> None:
     """Of a longer flight."""
     last = np.minimum(lives(judged), 5)
@@ -181,7 +200,7 @@ def test_a_flight_that_ends_early_is_no_success() -> None:
 def flown(n: int, **measures: Array) -> Flights:
     """Flights of which only returns and measures matter."""
     nothing: Any = np.zeros((n, 1, 1))
-    return Flights(np.random.default_rng(n).normal(size=n), measures, nothing, nothing)
+    return Flights(np.random.default_rng(n).normal(size=n), np.ones(n, bool), measures, nothing, nothing)
 
 
 @pytest.mark.parametrize("n", [1, 2, 19, 20, 21, 100, 1000])
