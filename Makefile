@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export view sweep tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
+.PHONY: help setup train evaluate export view sweep seeds tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -27,6 +27,9 @@ define HELP
   make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; rerun to resume
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
+  make seeds TASK=circle             train 100 seeds, a core each: how many fly, how soon, their spread; rerun to resume
+       SEEDS=100 FIRST=100             how many, and the first; OUT=runs/seeds_circle
+       ARGS="--preset circle_fast"     any flag of `qrl train`; --jobs N, --retry (seeds whose training failed)
   make figures                       the paper's six figures with captions, from runs that it makes and keeps
        FAST=1                          from shorter runs of fewer seeds
        ARGS="--only pendulum hover"    some of them; --fresh, --out FOLDER
@@ -58,6 +61,7 @@ need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
 
 # A run's config.json names its own task.
 $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
+$(call need,seeds,$(TASK),TASK is missing: make seeds TASK=circle ("make tasks" lists them))
 $(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/grids/pendulum_lr.json)
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
 $(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
@@ -80,6 +84,10 @@ view: $(STAMP)
 
 sweep: $(STAMP)
 	@exec $(QRL) sweep $(call quoted,$(GRID)) $(call flag,--out,$(OUT)) $(ARGS)
+
+seeds: $(STAMP)
+	@exec $(VENV)/bin/python -m experiments.seeds $(call quoted,$(TASK)) $(call flag,--seeds,$(SEEDS)) \
+		$(call flag,--first,$(FIRST)) $(call flag,--out,$(OUT)) $(ARGS)
 
 tasks: $(STAMP)
 	@exec $(QRL) tasks $(ARGS)

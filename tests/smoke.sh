@@ -7,7 +7,7 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export JAX_PLATFORMS=cpu
-unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS OUT RESUME CONFIG ARGS RUN GRID
+unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS FIRST OUT RESUME CONFIG ARGS RUN GRID
 
 qrl=.venv/bin/qrl
 python=.venv/bin/python
