@@ -7,13 +7,13 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 export JAX_PLATFORMS=cpu
-unset MAKEFLAGS MFLAGS MAKELEVEL TASK SEED SEEDS FIRST OUT RESUME CONFIG ARGS RUN GRID
+unset MAKEFLAGS MFLAGS MAKELEVEL TASK VEHICLE SEED SEEDS FIRST OUT RESUME CONFIG ARGS RUN GRID
 
 qrl=.venv/bin/qrl
 python=.venv/bin/python
 budget="--num-timesteps 1e5 --num-evals 3 --num-eval-envs 10" # a little beyond the warm-up
 long="--num-timesteps 4e5 --num-evals 20 --num-eval-envs 10"  # long enough to be interrupted after the first report
-vehicle=experiments/vehicles/crazyflie.json
+vehicle=envs/qrl_envs/vehicles/crazyflie.json
 
 work=$(mktemp -d)
 out="$work/a run" # with a space: it must survive make and the shell
@@ -169,7 +169,7 @@ bad_input() {
   refuses "a misspelt key" "typo.json.*gama" "$qrl" train hover --config "$work/typo.json" --out "$out/no"
 
   sed -E 's/("mass_kg": *)[0-9.]+/\1-1.0/' "$vehicle" >"$work/heavy.json"
-  refuses "a negative mass" "heavy.json.*mass_kg" "$qrl" train "$work/heavy.json" --out "$out/no"
+  refuses "a negative mass" "heavy.json.*mass_kg" "$qrl" train hover --vehicle "$work/heavy.json" --out "$out/no"
   [[ ! -e $out/no ]] || fail "a refused run left its folder"
 }
 
@@ -185,7 +185,7 @@ circle_and_crazyflie() {
   grep -q geometric "$out/circle/evaluation.json" || fail "no baselines"
   [[ -s $out/circle/settle.png ]] || fail "no map of settle times"
 
-  passes "train a vehicle of one's own" make train TASK="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
+  passes "train a vehicle of one's own" make train TASK=hover VEHICLE="$vehicle" OUT="$out/crazyflie" ARGS="$budget"
   complete "$out/crazyflie"
   passes "repeat it from its config.json" make train CONFIG="$out/crazyflie/config.json" OUT="$out/again"
   complete "$out/again"

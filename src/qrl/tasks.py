@@ -184,6 +184,10 @@ def check(env: Env, learner: Config, where: str) -> None:
             f"{where}: key 'observation_scale': expected {size} numbers, one for each observation, found {given}"
         )
     try:
+        adapt(env)
+    except ValueError as error:
+        raise BadInput(f"{where}: {error}") from None
+    try:
         state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
         jax.eval_shape(env.step, state, jax.ShapeDtypeStruct((env.action_size,), jax.numpy.float32))
     except Exception as error:  # somebody else's environment: whatever it raises, it cannot be trained on

@@ -28,8 +28,9 @@ from qrl.training.state import member_inputs
 from qrl_envs import io_spec, specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput
+from qrl_envs.vehicle import vehicle_data
 
-VEHICLE = Path(__file__).resolve().parents[2] / "experiments" / "vehicles" / "crazyflie.json"
+VEHICLE = {"extend": "hover", "vehicle": vehicle_data("crazyflie")}
 LONGEST = 1000  # characters of a message
 BUDGET = 2e7  # bytes of a grid's points
 
@@ -171,9 +172,7 @@ RECORD = GRID.record | {"versions": {"jax": "1"}, "devices": ["cpu"]}
 CHUNK = runner.record(RESULTS)
 TABLE = list(csv.reader(io.StringIO(files.csv_text(ROWS))))
 KINDS = {
-    "task": Kind(
-        "mine.json", reads_task, [*SHIPPED, tree(json.loads(VEHICLE.read_text())), tree({"extend": "circle"})]
-    ),
+    "task": Kind("mine.json", reads_task, [*SHIPPED, tree(VEHICLE), tree({"extend": "circle"})]),
     "config": Kind("mine.json", reads_config, [tree(RUN.model_dump(mode="json")), tree(PART)]),
     "stored": Kind("config.json", reads_stored, [tree(RUN.model_dump(mode="json"))]),
     "grid": Kind("mine.json", reads_grid, [tree(LISTED), tree(NAMED), tree(SPANNED), tree(SAMPLED)]),

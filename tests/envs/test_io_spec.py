@@ -1,13 +1,9 @@
 """What each number in and out is called: DESIGN.md, "Frames, units, order" and "Kernel"."""
 
-from pathlib import Path
-
 import pytest
 
 from qrl_envs import io_spec
 from qrl_envs import task as tasks
-
-CRAZYFLIE = Path(__file__).parents[2] / "experiments" / "vehicles" / "crazyflie.json"
 
 
 @pytest.mark.parametrize("name", ["hover", "circle"])
@@ -37,7 +33,7 @@ def test_actions_of_the_quadrotor() -> None:
 
 def test_actions_of_another_vehicle() -> None:
     """Its own motors, in its file's order, and its own hover thrust."""
-    found = io_spec.actions(tasks.load(str(CRAZYFLIE)))
+    found = io_spec.actions(tasks.load("hover", "crazyflie"))
     assert [port.position_m for port in found] == [
         (0.0325, 0.0325),
         (-0.0325, 0.0325),

@@ -263,12 +263,11 @@ def _list_tasks(_: argparse.Namespace) -> int:
     from qrl import tasks
     from qrl.cli.terminal import console
     from qrl_envs import task as task_spec
+    from qrl_envs.vehicle import shipped_vehicles
 
     for name in task_spec.shipped():
         console.print(f"{name:<10} {task_spec.load(name).description}")
     console.print(f"\nBrax's own: {', '.join(tasks.foreign_tasks())}")
-    console.print(
-        "Your vehicle: a .json file that extends one of the first, such as experiments/vehicles/crazyflie.json"
-    )
+    console.print(f"Vehicles (VEHICLE=): {', '.join(shipped_vehicles())}, or a .json file of yours")
     console.print("Your environment: module:factory, a function that returns an environment with Brax's reset and step")
     return DONE

@@ -8,7 +8,7 @@ from pathlib import Path
 from qrl.runs.files import replace_text
 
 MANIFEST = "manifest.json"
-FORMAT = 3
+FORMAT = 4
 _FORMER_MANIFEST = "seal.json"  # of formats 1 and 2
 
 
