@@ -132,7 +132,7 @@ def test_out_of_bounds_the_last_reward_goes_on() -> None:
     flights = jax.tree.map(np.asarray, evaluate.fly(OutOfBounds(), mean, keys(), LONGEST))
     last = np.minimum(lives(flights), LONGEST)
     np.testing.assert_array_equal(flights.returns, last * (last + 1) / 2 + (LONGEST - last) * last)
-    np.testing.assert_array_equal(flights.complete, lives(flights) >= LONGEST)
+    np.testing.assert_array_equal(flights.complete, lives(flights) > LONGEST)
 
 
 def test_return_counts_the_first_return_steps_alone(judged: Flights) -> None:

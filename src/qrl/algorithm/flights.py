@@ -16,7 +16,7 @@ class Flights(NamedTuple):
     """Leading axis: starts."""
 
     returns: chex.Array  # [n] sum of the first `return_steps` rewards, up to a termination
-    complete: chex.Array  # [n] bool: no end before the last step
+    complete: chex.Array  # [n] bool: no termination, and never out of bounds
     measures: dict[str, chex.Array]  # name -> [n]; empty where the environment measures nothing
     observations: chex.Array  # [n, steps + 1, F]; NaN from where an episode ended early
     actions: chex.Array  # [n, steps, A] clipped to [−1, 1]
@@ -40,7 +40,7 @@ def fly(
     measure = plan.measure if plan else None
     env, steps, return_steps = (plan.env, plan.steps, plan.return_steps) if plan else (env, *[max_episode_steps] * 2)
 
-    def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, ...]]:
+    def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
         state, total = carry
         action = jnp.clip(mean(state.info.get("sensor_obs", state.obs)), -1.0, 1.0)
         after = jax.vmap(env.step)(state, action)
@@ -48,14 +48,14 @@ def fly(
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
         terminated = over & ~info_flag(state, "out_of_bounds")
         total = total + jnp.where(terminated | (t >= return_steps), 0.0, held.reward)
-        return (held, total), (_observed(state), action, over)
+        return (held, total), (_observed(state), action)
 
     state = reset(env, keys)
     first = state, jnp.zeros(keys.shape[0])
-    (state, returns), (observations, actions, over) = jax.lax.scan(step, first, jnp.arange(steps))
+    (state, returns), (observations, actions) = jax.lax.scan(step, first, jnp.arange(steps))
     observations = jnp.concatenate([observations, _observed(state)[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
-    return Flights(returns, ~over[-1], measures, observations, actions.swapaxes(0, 1))
+    return Flights(returns, ~state.done.astype(bool), measures, observations, actions.swapaxes(0, 1))
 
 
 def _observed(state: State) -> chex.Array:

@@ -113,7 +113,7 @@ def map_states(
     inserted = jnp.max(states.buffer.inserted, initial=0, where=active)
     members = states._replace(unrolls=unrolls, buffer=states.buffer._replace(inserted=inserted))
     after = jax.vmap(one, in_axes=(axes, 0, None), out_axes=axes)(members, inputs, until)
-    buffer = after.buffer._replace(inserted=jnp.broadcast_to(after.buffer.inserted, active.shape))
+    buffer = after.buffer._replace(inserted=states.buffer.inserted + (after.buffer.inserted - inserted))
     after = after._replace(unrolls=jnp.broadcast_to(after.unrolls, active.shape), buffer=buffer)
     return jax.tree.map(lambda x, y: jnp.where(active.reshape(-1, *[1] * (x.ndim - 1)), x, y), after, states)
 

@@ -276,7 +276,9 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
             step = lambda i, now: apg_step(setup, inputs, first + i, now)  # noqa: E731
             return jax.lax.fori_loop(0, count, step, state)._replace(unrolls=until)
 
-        return sharding.map_states(one, states, inputs, until, states.unrolls >= states.learning_unrolls)
+        # Not a member that has just been brought to `until`, where its APG begins.
+        active = (states.unrolls >= states.learning_unrolls) & (states.unrolls < until)
+        return sharding.map_states(one, states, inputs, until, active)
 
     def fly_members(learners: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
         return sharding.map_members(lambda m: fly(setup, m[0], m[1], keys), (learners, inputs))
