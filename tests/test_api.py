@@ -96,15 +96,20 @@ def test_threads_are_not_taken_for_the_users_choice(
     assert seen == [before or "1"] * 2
 
 
-def test_task_config_seed_and_out_are_positional(asked: list[Any]) -> None:
+def test_task_vehicle_config_seed_and_out_are_positional(asked: list[Any]) -> None:
     config = qrl.Config.preset("pendulum").model_copy(update={"gamma": 0.5})
-    run = planned(asked, "pendulum", config, np.int64(7), "here")
+    run = planned(asked, "pendulum", None, config, np.int64(7), "here")
     assert (run.learner, run.seed, asked[-1].out) == (config, 7, Path("here"))
+
+
+def test_a_vehicle_flies_the_task(asked: list[Any]) -> None:
+    assert planned(asked, "circle", "crazyflie").task.spec["vehicle"]["mass_kg"] == 0.028
+    assert asked[-1].out == Path("runs/circle_crazyflie")
 
 
 def test_a_file_gives_hyperparameters_too(asked: list[Any], tmp_path: Path) -> None:
     (tmp_path / "mine.json").write_text('{"learner": {"gamma": 0.5, "lam": 0.25}}')
-    learner = planned(asked, "pendulum", "mine.json", lam=0.75).learner
+    learner = planned(asked, "pendulum", config="mine.json", lam=0.75).learner
     assert (learner.gamma, learner.lam) == (0.5, 0.75)
 
 
@@ -181,7 +186,7 @@ def test_former_names_are_read_with_a_warning(asked: list[Any]) -> None:
 
 def test_a_former_name_overrides_a_config(asked: list[Any]) -> None:
     with pytest.warns(FutureWarning, match="lanes is now num_envs"):
-        assert planned(asked, "pendulum", qrl.Config.preset("pendulum"), lanes=32).learner.num_envs == 32
+        assert planned(asked, "pendulum", config=qrl.Config.preset("pendulum"), lanes=32).learner.num_envs == 32
 
 
 def test_a_configured_compilation_cache_stays(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
