@@ -192,7 +192,7 @@ def test_wrong_input_is_one_line(stand_in: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_what_train_refuses_ends_the_campaign(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--gama" in complaint(capsys, tmp_path, "--gama", "0.9", "--jobs", "1")
+    assert "--gama" in complaint(capsys, tmp_path, "--seeds", "2", "--gama", "0.9", "--jobs", "1")
     assert not (tmp_path / "seeds.csv").exists()
     assert not (tmp_path / "101").exists()
 
