@@ -13,7 +13,7 @@ import shlex
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -108,9 +108,9 @@ def run(rows: dict[int, Row], out: Path, words: list[str], jobs: int, *, retry: 
             ended(seed, f"failed with exit code {code}: {said[-1]}" if code else FINISHED)
 
 
-def train(waiting: list[int], out: Path, words: list[str], jobs: int) -> Iterator[tuple[int, int]]:
+def train(waiting: list[int], out: Path, words: list[str], jobs: int) -> Generator[tuple[int, int], None, None]:
     """Train `jobs` seeds at a time; yields a seed and its exit code as it ends. To close it saves and ends the rest."""
-    running: dict[int, subprocess.Popen[bytes]] = {}
+    running: dict[int, subprocess.Popen[Any]] = {}
     env = runs.environment() | ONE_CORE
     try:
         while waiting or running:

@@ -192,7 +192,7 @@ def test_wrong_input_is_one_line(stand_in: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_what_train_refuses_ends_the_campaign(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "--gama" in complaint(capsys, tmp_path, "--gama", "0.9", "--jobs", "1")
+    assert "--gama" in complaint(capsys, tmp_path, "--seeds", "2", "--gama", "0.9", "--jobs", "1")
     assert not (tmp_path / "seeds.csv").exists()
     assert not (tmp_path / "101").exists()
 
@@ -264,7 +264,7 @@ def test_the_share_that_flies_holds_the_last_report(tmp_path: Path) -> None:
         ]
         files.write_metrics(tmp_path / f"{seed}", rows)
     status = {100: "done", 101: "done", 102: "failed", 103: "failed"}
-    rows = [{"seed": seed, "status": status[seed]} for seed in reported]
-    steps, share = seeds_report.share_that_flies(rows, tmp_path)
+    ended = [{"seed": seed, "status": status[seed]} for seed in reported]
+    steps, share = seeds_report.share_that_flies(ended, tmp_path)
     assert steps.tolist() == [10, 15, 20, 25, 30]
     assert share.tolist() == [0.25, 0.25, 0.5, 0.25, 0.25]
