@@ -282,10 +282,9 @@ def _completed(data: dict[str, Any]) -> dict[str, Any]:
         if isinstance(part, dict) and isinstance(period, int | float) and _positive(part.get(former)):
             part[name] = part.pop(former) * period
     for part in (data, evaluation):
-        reward = part.get("reward") if isinstance(part, dict) else None
-        radius = reward.get("radius_m") if isinstance(reward, dict) else None
-        if _positive(radius) and reward.get("w5_direction_s_m2") is None:
-            part["reward"] = reward | {"w5_direction_s_m2": W5_RADIUS_S_M / radius}
+        reward: Any = part.get("reward") if isinstance(part, dict) else None
+        if isinstance(part, dict) and isinstance(reward, dict) and _positive(reward.get("radius_m")):
+            part["reward"] = {"w5_direction_s_m2": W5_RADIUS_S_M / reward["radius_m"]} | reward
     return data | {"vehicle": with_default_scale(data["vehicle"])} if "vehicle" in data else data
 
 

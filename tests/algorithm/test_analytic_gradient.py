@@ -168,6 +168,7 @@ def test_updates_raise_the_return_and_move_the_policy_alone() -> None:
 
     update = jax.jit(lambda now, i: ours.apg_update(now, flown, i, ours.config.num_apg_updates))
     state = first = ours.init(jax.random.PRNGKey(1))
+    sums = jnp.zeros(2)
     for i in range(30):
         state, _, sums, skipped = update(state, i)
         assert not skipped

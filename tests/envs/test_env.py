@@ -306,7 +306,8 @@ def test_whatever_bound_is_left_costs_the_same(any_world: World) -> None:
     """The reward at 20 m above the origin, upside down, under full action; less than nearer ones. No NaN spoils it."""
     if any_world.name == "pendulum":
         pytest.skip("it has no bounds")
-    spec, rate = any_world.env.task.reward, np.zeros((LANES, 3))
+    spec: Any = any_world.env.task.reward
+    rate = np.zeros((LANES, 3))
     position = np.array([[20.1, 0, 0], [0, 0, -25.0], [0.1, 0, 0], [0, 0, 0], [0, 0.5, 0], [np.nan, 0, 0]])
     rate[2:4, :] = [[101.0, 0, 0], [0, 0, -150.0]]
     after = any_world.step(placed(any_world.start, position_m=position, body_rate_rad_s=rate), jnp.zeros((LANES, 4)))

@@ -122,17 +122,17 @@ def run_chunks(
         extended: dict[int, int] = {}
         handing_over = (handover == done) & (done < config.num_unrolls)
         if done == report_at or handing_over.any():
-            flights = programs.gather(programs.fly(states.learner, inputs, starts))
+            flights: Flights = programs.gather(programs.fly(states.learner, inputs, starts))
             flies = flights.complete.mean(axis=1) >= FLIES
             longer = np.where(handing_over & ~flies, config.extended_learning(done), handover)
             extended = {int(i): longer[i] * config.steps_per_unroll for i in np.flatnonzero(longer > handover)}
             if extended:
                 states = _with_learning_unrolls(states, config, longer)
-        if done == report_at:
-            updates, totals = programs.gather((states.learner.updates, states.totals))
-            rows = _rows(done * config.steps_per_unroll, updates, totals, flights, clock)
-            clock = clock._replace(report_seconds=0.0)
-            states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
+            if done == report_at:
+                updates, totals = programs.gather((states.learner.updates, states.totals))
+                rows = _rows(done * config.steps_per_unroll, updates, totals, flights, clock)
+                clock = clock._replace(report_seconds=0.0)
+                states = states._replace(totals=jax.tree.map(jnp.zeros_like, states.totals))
         yield Chunk(states, done * config.steps_per_unroll, speed, seconds_left, clock, rows, extended, faults)
 
 

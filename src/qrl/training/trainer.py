@@ -60,7 +60,8 @@ def init_state(setup: Setup, seed: chex.Array, inputs: MemberInputs) -> TrainSta
     _, transitions = jax.eval_shape(lambda *x: collect(setup, hyper, *x), first, lanes, key, start_key)
     buffer = replay_buffer.create(transitions, config.replay_unrolls)
     zero = jnp.float32(0.0)
-    totals = Totals(*[zero] * 6, UpdateMetrics(*[zero] * len(UpdateMetrics._fields)))
+    metrics = UpdateMetrics(*[zero] * len(UpdateMetrics._fields))
+    totals = Totals(rewards=zero, steps=zero, episodes=zero, early=zero, updates=zero, skipped=zero, metrics=metrics)
     state = TrainState(
         learner=first,
         buffer=buffer,
