@@ -68,7 +68,21 @@ def test_commands_exist(line: str) -> None:
         makefile = (ROOT / "Makefile").read_text()
         for target in targets:
             assert re.search(rf"^(\$\(or )?{target}\)?:", makefile, flags=re.MULTILINE), target
-        known = {"TASK", "SEED", "SEEDS", "FIRST", "OUT", "RESUME", "CONFIG", "ARGS", "RUN", "GRID", "FAST", "PYTHON"}
+        known = {
+            "TASK",
+            "VEHICLE",
+            "SEED",
+            "SEEDS",
+            "FIRST",
+            "OUT",
+            "RESUME",
+            "CONFIG",
+            "ARGS",
+            "RUN",
+            "GRID",
+            "FAST",
+            "PYTHON",
+        }
         assert set(variables) <= known
         command = targets[0] if targets else ""
         subject = variables.get({"train": "TASK", "sweep": "GRID"}.get(command, "RUN"), "x")

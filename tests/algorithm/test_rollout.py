@@ -376,7 +376,8 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
 
 def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
     """Our own environment, with bounds so near that most lanes leave them: the loop's steps, never a termination."""
-    spec = task.from_data({"extend": "hover", "start": {"velocity_m_s": 9.0}, "bounds": {"distance_m": 3.0}}, "here")
+    near = {"start": {"position_m": 1.5, "velocity_m_s": 9.0}, "evaluation": {"start": {"position_m": 1.5}}}
+    spec = task.from_data({"extend": "hover", "bounds": {"distance_m": 3.0}} | near, "here")
     env, sigma = worlds.from_task(spec), jnp.float32(0.3)
 
     def still(observation: jax.Array) -> jax.Array:

@@ -165,7 +165,7 @@ def test_starts_fill_their_ranges_and_no_more(any_world: World) -> None:
     """1,200 starts: each coordinate within ± its range, near both ends, and none the copy of another."""
     draws = [any_world.reset(keys(seed)).pipeline_state.x for seed in range(200)]
     columns = []
-    for field, reach in any_world.env.task.start.model_dump().items():
+    for field, reach in any_world.env.task.start.model_dump(exclude={"tilt_rad"}).items():
         drawn = np.concatenate([coordinates(any_world.name, x)[field].reshape(LANES, -1) for x in draws])
         assert np.abs(drawn).max() <= np.float32(reach)
         assert (drawn.max(axis=0) > 0.98 * reach).all()
@@ -341,7 +341,7 @@ def test_evaluation_flies_its_own_starts_and_reward() -> None:
     plan = env.from_task(spec).evaluation()
     assert isinstance(plan.env, TaskEnv)
     assert (plan.steps, plan.return_steps) == (800, 200)
-    np.testing.assert_allclose(plan.env.params.start, [2.0, 1.0, 1.0])
+    np.testing.assert_allclose(plan.env.params.start, [2.0, 1.0, 1.0, np.pi], rtol=1e-6)
     np.testing.assert_allclose(plan.env.params.reward, [1.0, 0.2, 0.2, 0.2])
 
 

@@ -81,7 +81,8 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
         raise BadInput(f"{out}: holds a run already; give another OUT, or RESUME=1 to resume it")
     if exists:
         seed = args.seed if args.seed is not None else file.seed
-        config = request.resumed(out, config, file.learner | flags, seed, args.seeds or file.seeds)
+        preset = tasks.task_preset(config.task, "--preset", args.preset) if args.preset else {}
+        config = request.resumed(out, config, preset | file.learner | flags, seed, args.seeds or file.seeds)
         if loop.finished(out, config):
             console.print(f"{out}: complete already; nothing to do")
             return None

@@ -19,7 +19,7 @@ DIGITS = 6  # significant digits of the values of a range
 # Columns of results.csv, and prefixes of others: no axis may have such a name.
 COLUMNS = (
     *("point", "seed", "seeds", "diverged", "env_steps", "updates", "return_mean", "return_min", "success"),
-    *("train_seconds", "steps_per_second", "reward_mean", "ended_early", *UpdateMetrics._fields),
+    *("train_seconds", "steps_per_second", "reward_mean", "ended_early", "apg_skipped", *UpdateMetrics._fields),
 )
 MEASURES = ("settle_", "rms_")
 EVALUATION = "task.evaluation"  # the same for all points, else they could not be compared
