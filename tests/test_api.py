@@ -10,24 +10,12 @@ import numpy as np
 import pytest
 
 import qrl
+from cli_helpers import TINY_VALUES
 from qrl import api
 from qrl.cli import train as command
 from qrl_envs.specfile import BadInput
 
-TINY: dict[str, Any] = {
-    "num_timesteps": 400,
-    "num_envs": 4,
-    "unroll_length": 10,
-    "batch_size": 2,
-    "updates_per_unroll": 1,
-    "num_evals": 2,
-    "num_eval_envs": 3,
-    "warmup_unrolls": 2,
-    "replay_unrolls": 2,
-    "policy_hidden_layer_sizes": [4],
-    "critic_hidden_layer_sizes": [4],
-    "quiet": True,
-}
+TINY: dict[str, Any] = TINY_VALUES | {"quiet": True}
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ from qrl_envs.specfile import BadInput, Positive, Real, Spec
 STANDARD_GRAVITY_M_S2 = 9.81
 INERTIA_TOLERANCE = 0.05  # measured inertias are rounded: excess over a rigid body's bound that is accepted
 MOST_ARM_PER_GYRATION = 30.0  # distance of a motor per radius of gyration, above which a length has a wrong unit
-LEAST_ANGULAR_ACCELERATION_RAD_S2 = 3.0  # about x and y, below which a vehicle can only just be turned
+LEAST_ANGULAR_ACCELERATION_RAD_S2 = 3.0  # about x and y, below which a vehicle can only just be rotated
 LEAST_YAW_ACCELERATION_RAD_S2 = 0.3
 RECOVERY_M = 2.0
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover

@@ -1,14 +1,26 @@
 """The command line, called as a user would, and a run that is over in a moment."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from qrl.cli.main import main
 
-TINY = "--num-timesteps 400 --num-envs 4 --unroll-length 10 --batch-size 2 --updates-per-unroll 1 --num-evals 2"
-TINY += " --num-eval-envs 3 --warmup-unrolls 2 --replay-unrolls 2"
-TINY += " --policy-hidden-layer-sizes [4] --critic-hidden-layer-sizes [4]"
+TINY_VALUES: dict[str, Any] = {
+    "num_timesteps": 400,
+    "num_envs": 4,
+    "unroll_length": 10,
+    "batch_size": 2,
+    "updates_per_unroll": 1,
+    "num_evals": 2,
+    "num_eval_envs": 3,
+    "warmup_unrolls": 2,
+    "replay_unrolls": 2,
+    "policy_hidden_layer_sizes": [4],
+    "critic_hidden_layer_sizes": [4],
+}
+TINY = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in TINY_VALUES.items())
 
 
 def qrl(*words: str | Path) -> int:

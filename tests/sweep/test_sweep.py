@@ -16,7 +16,7 @@ import jax
 import numpy as np
 import pytest
 
-from cli_helpers import complaint, qrl
+from cli_helpers import TINY_VALUES, complaint, qrl
 from qrl.cli import sweep
 from qrl.runs import files
 from qrl.sweep import plot, results, runner
@@ -28,26 +28,13 @@ from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 
-TINY = {
-    "num_timesteps": 400,
-    "num_envs": 4,
-    "unroll_length": 10,
-    "batch_size": 2,
-    "updates_per_unroll": 1,
-    "num_evals": 2,
-    "num_eval_envs": 3,
-    "warmup_unrolls": 2,
-    "replay_unrolls": 2,
-    "policy_hidden_layer_sizes": [4],
-    "critic_hidden_layer_sizes": [4],
-}
 AXES = {"learning_rate": [1e-3, 1e-2, 1e30], "task.rod.mass_kg": [1.3, 1.0]}  # the last step size diverges
 Rows = list[dict[str, str]]
 
 
 def write_grid(folder: Path, axes: dict[str, Any], **more: Any) -> Path:
     path = folder / "grid.json"
-    path.write_text(json.dumps({"task": "pendulum", "fixed": TINY, "axes": axes, "seeds": [0, 3], **more}))
+    path.write_text(json.dumps({"task": "pendulum", "fixed": TINY_VALUES, "axes": axes, "seeds": [0, 3], **more}))
     return path
 
 
@@ -224,7 +211,7 @@ def test_a_chunk_is_recorded_whole_or_not_at_all(tmp_path: Path, laps: int, reco
 def test_ctrl_c_ends_with_exit_code_1_and_keeps_its_chunks(tmp_path: Path) -> None:
     """A real process, a real SIGINT, after the first chunk of many; it leaves no results that look whole."""
     grid = write_grid(
-        tmp_path, {"gamma": {"from": 0.5, "to": 0.99, "count": 200}}, fixed={**TINY, "num_timesteps": 4000}
+        tmp_path, {"gamma": {"from": 0.5, "to": 0.99, "count": 200}}, fixed={**TINY_VALUES, "num_timesteps": 4000}
     )
     process = subprocess.Popen(
         [sys.executable, "-m", "qrl", "sweep", grid, "--out", tmp_path / "out"],
@@ -314,7 +301,7 @@ def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: p
 
 def test_a_member_too_large_for_the_budget_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """It says how many points and how much memory, and leaves nothing."""
-    small = {name: value for name, value in TINY.items() if name != "replay_unrolls"}
+    small = {name: value for name, value in TINY_VALUES.items() if name != "replay_unrolls"}
     grid = write_grid(tmp_path, {"gamma": [0.8, 0.9], "replay_unrolls": [2, 1_000_000]}, fixed=small)
     said = complaint(capsys, "sweep", grid, "--out", tmp_path / "out", "--memory-gb", "2")
     assert "fit into 2 GB of memory, found 2 points (such as gamma 0.8, replay_unrolls 1000000)" in said
@@ -337,7 +324,7 @@ def test_chunks_keep_to_the_budget(members: int, workers: int, budget: float) ->
 def test_the_estimate_of_a_chunk_covers_what_xla_needs(tmp_path: Path, members: int) -> None:
     """XLA's own account of the compiled training: arguments, results and scratch."""
     grid = load(
-        write_grid(tmp_path, {"gamma": [0.9]}, fixed={**TINY, "replay_unrolls": 50, "num_timesteps": 4000}), 1e9
+        write_grid(tmp_path, {"gamma": [0.9]}, fixed={**TINY_VALUES, "replay_unrolls": 50, "num_timesteps": 4000}), 1e9
     )
     env, config = worlds.make("pendulum"), grid.points[0].learner
     trainer, here = make_trainer(env, config), member_inputs(env, config)

@@ -19,7 +19,7 @@ from qrl.training.trainer import Trainer
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # target duration of one call of a compiled program
-FLIES = 0.9  # share of a report's flights within the bounds from which APG may begin
+HANDOVER_SHARE = 0.9  # share of a report's flights within the bounds from which APG may begin
 
 
 class NotFinite(RuntimeError):
@@ -123,7 +123,7 @@ def run_chunks(
         handing_over = (handover == done) & (done < config.num_unrolls)
         if done == report_at or handing_over.any():
             flights: Flights = programs.gather(programs.fly(states.learner, inputs, starts))
-            flies = flights.complete.mean(axis=1) >= FLIES
+            flies = flights.complete.mean(axis=1) >= HANDOVER_SHARE
             longer = np.where(handing_over & ~flies, config.extended_learning(done), handover)
             extended = {int(i): longer[i] * config.steps_per_unroll for i in np.flatnonzero(longer > handover)}
             if extended:
