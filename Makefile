@@ -69,7 +69,8 @@ $(call need,view,$(RUN),RUN is missing: make view RUN=runs/circle)
 
 train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
-		$(call flag,--vehicle,$(VEHICLE)) $(call flag,--out,$(OUT)) $(if $(filter-out 0,$(RESUME)),--resume) \
+		$(call flag,--vehicle,$(VEHICLE)) $(call flag,--uncertainty,$(UNCERTAINTY)) $(call flag,--out,$(OUT)) \
+		$(if $(filter-out 0,$(RESUME)),--resume) \
 		$(call flag,--config,$(CONFIG)) $(ARGS)
 
 evaluate: $(STAMP)

@@ -14,13 +14,18 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import chex
+import jax
 import jax.numpy as jnp
 from flax import struct
 
-from qrl_envs import measures, pendulum, quadrotor, rewards, symmetry
+from qrl_envs import measures, pendulum, plant, quadrotor, rewards, symmetry
 from qrl_envs import task as tasks
 from qrl_envs.symmetry import Symmetry
 from qrl_envs.task import PendulumTask, QuadrotorTask, Task
+from qrl_envs.uncertainty import Uncertainty
+
+
+WORLD_STREAM = 1_000_003  # folded into a start's key, so that a world does not share the start's random numbers
 
 
 class Params(NamedTuple):
@@ -95,6 +100,7 @@ class TaskEnv(abc.ABC):
         return self.task.control_period_s
 
     differentiable = True  # step and reward
+    policy_observation_size: int | None = None  # a policy sees this many numbers of an observation; None: all
 
     def with_params(self, params: Params) -> "TaskEnv":
         """A copy with other parameters of the same structure, which may be tracers."""
@@ -115,14 +121,17 @@ class TaskEnv(abc.ABC):
         return self._reset(state.pipeline_state.params, rng)
 
     def step(self, state: State, action: chex.Array) -> State:
-        """One control period under `action` [A], clipped to [−1, 1]."""
+        """One control period under `action` [A], clipped to [−1, 1]; differentiable in state and action, not in the
+        task's parameters, which are constants of a flight.
+        """
         lane: Lane = state.pipeline_state
+        lane = lane._replace(params=jax.lax.stop_gradient(lane.params))
         x, reward = self._advance(lane.params, lane.x, action)
         out = self._out_of_bounds(lane.params, x)
         reward, done = jnp.where(out, self._reward_out_of_bounds(lane.params), reward), out.astype(jnp.float32)
         return state.replace(
             pipeline_state=Lane(x, lane.params),
-            obs=self._observe(x),
+            obs=self._observe(lane.params, x),
             reward=reward,
             done=done,
             info={**state.info, "truncated": done, "out_of_bounds": done},
@@ -136,7 +145,7 @@ class TaskEnv(abc.ABC):
         x = self._draw(params, rng)
         zero = jnp.float32(0.0)
         return State(
-            Lane(x, params), self._observe(x), zero, zero, metrics={}, info={"truncated": zero, "out_of_bounds": zero}
+            Lane(x, params), self._observe(params, x), zero, zero, metrics={}, info={"truncated": zero, "out_of_bounds": zero}
         )
 
     @abc.abstractmethod
@@ -146,7 +155,7 @@ class TaskEnv(abc.ABC):
     def _advance(self, params: Params, x: Any, action: chex.Array) -> tuple[Any, chex.Array]: ...
 
     @abc.abstractmethod
-    def _observe(self, x: Any) -> chex.Array: ...
+    def _observe(self, params: Params, x: Any) -> chex.Array: ...
 
     def _out_of_bounds(self, params: Params, x: Any) -> chex.Array:
         """Whether the episode ends early in state `x`; bool []."""
@@ -176,7 +185,7 @@ class QuadrotorEnv(TaskEnv):
         bounds = {name: jnp.float32(value) for name, value in task.bounds.model_dump().items()}
         reward = rewards.from_spec(task.reward)
         params = Params(quadrotor.physics(task.vehicle), reward, quadrotor.start(task.start), bounds)
-        super().__init__(task, params, observation_size=18, action_size=4)
+        super().__init__(task, params, observation_size=18, action_size=len(task.vehicle.motors))
 
     def reset_calibration(self, rng: chex.PRNGKey) -> State:
         return self._reset(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
@@ -189,7 +198,8 @@ class QuadrotorEnv(TaskEnv):
         body = quadrotor.step(params.physics, x, thrust, self.task.control_period_s)
         return body, params.reward(body, quadrotor.applied_action(params.physics, thrust))
 
-    def _observe(self, x: quadrotor.Body) -> chex.Array:
+    def _observe(self, params: Params, x: quadrotor.Body) -> chex.Array:
+        del params
         return quadrotor.observe(x)
 
     def _out_of_bounds(self, params: Params, x: quadrotor.Body) -> chex.Array:
@@ -227,6 +237,84 @@ class QuadrotorEnv(TaskEnv):
         return Evaluation(env, round(spec.duration_s / dt_s), round(spec.return_s / dt_s), measure)
 
 
+class RealParams(NamedTuple):
+    """`Params`, and the ranges of what differs from flight to flight."""
+
+    physics: Any
+    reward: Any
+    start: Any
+    bounds: Any
+    ranges: plant.Ranges
+
+
+class RealQuadrotorEnv(QuadrotorEnv):
+    """Hover or circle with a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
+
+    Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, then its
+    memory, as the task has it: previous action [N], integral of the position error [3]; then what only a critic may see
+    (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as in `QuadrotorEnv`.
+    """
+
+    def __init__(
+        self, task: QuadrotorTask, uncertainty: Uncertainty | None = None, most_latency_s: float | None = None
+    ) -> None:
+        super().__init__(task)
+        uncertainty = uncertainty or task.uncertainty or Uncertainty()
+        self.params: Any = RealParams(*self.params, plant.ranges(uncertainty, task.vehicle))
+        motors, memory = len(task.vehicle.motors), task.memory
+        self.policy_observation_size = 18 + memory.previous_action * motors + 3 * (memory.integral is not None)
+        self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
+        latency_s = uncertainty.latency_s[1] if most_latency_s is None else most_latency_s
+        self._steps_late = plant.delayed_steps(latency_s, task.control_period_s)
+
+    def step(self, state: State, action: chex.Array) -> State:
+        return self._with_truth(super().step(state, action))
+
+    def _reset(self, params: Any, rng: chex.PRNGKey) -> State:
+        return self._with_truth(super()._reset(params, rng))
+
+    def _with_truth(self, state: State) -> State:
+        return state.replace(info={**state.info, "true_obs": quadrotor.observe(state.pipeline_state.x.body)})
+
+    def _start(self, params: Any, key: chex.PRNGKey) -> quadrotor.Body:
+        return quadrotor.draw(params.start, key)
+
+    def _draw(self, params: Any, rng: chex.PRNGKey) -> plant.Flight:
+        # The start's key is that of the ideal world: the same starts, whatever the plant.
+        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (plant.DRAWS + self.action_size,))
+        return plant.begin(
+            self._start(params, rng),
+            plant.draw(params.ranges, params.physics, u),
+            self._steps_late,
+            self.task.memory.integral,
+            self.task.control_period_s,
+        )
+
+    def _advance(self, params: Params, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
+        x = x._replace(world=jax.lax.stop_gradient(x.world))
+        flight = plant.step(x, action, self.task.memory.integral, self.task.control_period_s)
+        return flight, params.reward(flight.body, flight.previous_action)
+
+    def _observe(self, params: Params, x: plant.Flight) -> chex.Array:
+        memory = self.task.memory
+        seen = plant.observe(x, memory.previous_action, memory.integral)
+        return jnp.concatenate([seen, plant.privileged(x, params.physics, self.task.control_period_s)])
+
+    def _out_of_bounds(self, params: Params, x: plant.Flight) -> chex.Array:
+        return super()._out_of_bounds(params, x.body)
+
+    def symmetry(self, u: chex.Array) -> Symmetry:
+        plain, memory = super().symmetry(u), self.task.memory
+        world, body = plain.observation[9:12, 9:12], plain.observation[15:18, 15:18]
+        parts = [plain.observation]
+        if memory.previous_action:
+            parts.append(plain.action)
+        if memory.integral is not None:
+            parts.append(world)
+        parts += [world, body, jnp.eye(plant.PRIVILEGED - 6), plain.action]
+        return Symmetry(jax.scipy.linalg.block_diag(*parts), plain.action)
+
+
 class PendulumEnv(TaskEnv):
     """Gymnasium's Pendulum-v1. Observation [3]: cos θ, sin θ, θ̇ [rad/s]; action [1] in [−1, 1]: torque/max_torque."""
 
@@ -245,7 +333,8 @@ class PendulumEnv(TaskEnv):
         torque = pendulum.torque_N_m(params.physics, action)
         return pendulum.step(params.physics, x, torque, self.task.control_period_s), params.reward(x, torque)
 
-    def _observe(self, x: pendulum.Pendulum) -> chex.Array:
+    def _observe(self, params: Params, x: pendulum.Pendulum) -> chex.Array:
+        del params
         return pendulum.observe(x)
 
     def symmetry(self, u: chex.Array) -> Symmetry:
@@ -267,7 +356,9 @@ class PendulumEnv(TaskEnv):
 
 def from_task(task: Task) -> TaskEnv:
     """The Brax environment of a task."""
-    return QuadrotorEnv(task) if isinstance(task, QuadrotorTask) else PendulumEnv(task)
+    if not isinstance(task, QuadrotorTask):
+        return PendulumEnv(task)
+    return QuadrotorEnv(task) if task.ideal else RealQuadrotorEnv(task)
 
 
 def make(name_or_path: str) -> TaskEnv:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from qrl_envs import integrate, rotation
 from qrl_envs.task import FlightStart
@@ -15,15 +16,15 @@ from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle
 
 
 class Physics(NamedTuple):
-    """A vehicle's parameters as float32 arrays, so that they batch and differentiate."""
+    """A vehicle's parameters as float32 arrays, so that they batch and differentiate; N motors."""
 
     mass_kg: chex.Array  # []
-    inertia_kg_m2: chex.Array  # [3] principal, about body x, y, z
-    motor_position_m: chex.Array  # [4, 2] x, y in the body frame
-    motor_spin: chex.Array  # [4] +1: reaction torque positive about body z
-    motor_max_N: chex.Array  # [4]
-    yaw_moment_m: chex.Array  # [] reaction torque per thrust
-    hover_thrust_N: chex.Array  # [4] F_o: carries the weight without torque; mg/4 each in the paper (equ:forceOutput)
+    inertia_kg_m2: chex.Array  # [3] about body x, y, z; or the matrix [3, 3]
+    motor_axis: chex.Array | None  # [3, N] unit vectors of thrust, body frame; None: all along body z
+    motor_torque_m: chex.Array  # [3, N] torque about body x, y, z per thrust
+    motor_min_N: chex.Array  # [N]
+    motor_max_N: chex.Array  # [N]
+    hover_thrust_N: chex.Array  # [N] F_o: carries the weight without torque; mg/4 each in the paper (equ:forceOutput)
     action_scale_N: chex.Array  # []
     gravity_m_s2: chex.Array  # []
 
@@ -56,13 +57,16 @@ class Start(NamedTuple):
 
 def physics(vehicle: Vehicle) -> Physics:
     """The parameters of a vehicle file."""
+    along_z = np.allclose(vehicle.motor_axes[:2], 0.0, atol=1e-9)
+    principal = len(vehicle.inertia_kg_m2) == 3
+    inertia = vehicle.inertia_kg_m2 if principal else vehicle.inertia_matrix_kg_m2
     return Physics(
         mass_kg=jnp.float32(vehicle.mass_kg),
-        inertia_kg_m2=jnp.asarray(vehicle.inertia_kg_m2, jnp.float32),
-        motor_position_m=jnp.asarray([m.position_m for m in vehicle.motors], jnp.float32),
-        motor_spin=jnp.asarray([m.spin for m in vehicle.motors], jnp.float32),
+        inertia_kg_m2=jnp.asarray(inertia, jnp.float32),
+        motor_axis=None if along_z else jnp.asarray(vehicle.motor_axes, jnp.float32),
+        motor_torque_m=jnp.asarray(vehicle.torques_m, jnp.float32),
+        motor_min_N=jnp.asarray([m.min_N for m in vehicle.motors], jnp.float32),
         motor_max_N=jnp.asarray([m.max_N for m in vehicle.motors], jnp.float32),
-        yaw_moment_m=jnp.float32(vehicle.yaw_moment_m),
         hover_thrust_N=jnp.asarray(vehicle.hover_thrusts_N, jnp.float32),
         action_scale_N=jnp.float32(vehicle.action_scale_N),
         gravity_m_s2=jnp.float32(STANDARD_GRAVITY_M_S2),
@@ -75,48 +79,67 @@ def start(ranges: FlightStart) -> Start:
 
 
 def thrust_N(physics: Physics, action: chex.Array) -> chex.Array:
-    """F = clip(F_o + action_scale·a, 0, max) of each motor [N], for an action clipped to [−1, 1]; [4] -> [4]."""
+    """F = clip(F_o + action_scale·a, min, max) of each motor [N], for an action clipped to [−1, 1]; [N] -> [N]."""
     command = physics.hover_thrust_N + physics.action_scale_N * jnp.clip(action, -1.0, 1.0)
-    return jnp.clip(command, 0.0, physics.motor_max_N)
+    return jnp.clip(command, physics.motor_min_N, physics.motor_max_N)
 
 
 def applied_action(physics: Physics, thrust: chex.Array) -> chex.Array:
-    """The action of rewards: a = (F − F_o)/action_scale for the applied thrust F [N]; [4] -> [4]."""
+    """The action of rewards: a = (F − F_o)/action_scale for the applied thrust F [N]; [N] -> [N]."""
     return (thrust - physics.hover_thrust_N) / physics.action_scale_N
 
 
-def derivative(physics: Physics, body: Body, thrust: chex.Array) -> Body:
-    """d(body)/dt under gravity and motor thrust [4] [N] along body z, by the Newton–Euler equations."""
+class Disturbance(NamedTuple):
+    """What acts on the body beside gravity and motors."""
+
+    drag_N_s_m: chex.Array  # [3] linear, along body x, y, z
+    wind_m_s: chex.Array  # [3] world
+    force_N: chex.Array  # [3] world
+    torque_N_m: chex.Array  # [3] body
+
+
+def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Disturbance | None = None) -> Body:
+    """d(body)/dt under gravity and motor thrust [N] [N], by the Newton–Euler equations."""
     omega = body.twist.body_rate_rad_s
-    x, y = physics.motor_position_m[:, 0], physics.motor_position_m[:, 1]
-    torque = jnp.stack(
-        [jnp.sum(y * thrust), -jnp.sum(x * thrust), physics.yaw_moment_m * jnp.sum(physics.motor_spin * thrust)]
-    )
-    body_z = rotation.matrix(body.pose.attitude)[:, 2]
+    torque = jnp.sum(physics.motor_torque_m * thrust, axis=-1)
+    rotation_matrix = rotation.matrix(body.pose.attitude)
+    if physics.motor_axis is None:
+        acceleration = rotation_matrix[:, 2] * (jnp.sum(thrust) / physics.mass_kg)
+    else:
+        acceleration = _product(rotation_matrix, jnp.sum(physics.motor_axis * thrust, axis=-1) / physics.mass_kg)
+    if disturbance is not None:
+        air_speed = _product(rotation_matrix.T, body.twist.velocity_m_s - disturbance.wind_m_s)  # body
+        drag = _product(rotation_matrix, disturbance.drag_N_s_m * air_speed)
+        acceleration = acceleration + (disturbance.force_N - drag) / physics.mass_kg
+        torque = torque + disturbance.torque_N_m
     gravity = jnp.stack([jnp.zeros_like(physics.gravity_m_s2)] * 2 + [physics.gravity_m_s2])
+    inertia = physics.inertia_kg_m2
+    if inertia.ndim == 1:
+        angular = (torque - jnp.cross(omega, inertia * omega)) / inertia
+    else:
+        angular = _solve(inertia, torque - jnp.cross(omega, _product(inertia, omega)))
     return Body(
         pose=Pose(body.twist.velocity_m_s, rotation.derivative(body.pose.attitude, omega)),
-        twist=Twist(
-            velocity_m_s=body_z * (jnp.sum(thrust) / physics.mass_kg) - gravity,
-            body_rate_rad_s=(torque - jnp.cross(omega, physics.inertia_kg_m2 * omega)) / physics.inertia_kg_m2,
-        ),
+        twist=Twist(velocity_m_s=acceleration - gravity, body_rate_rad_s=angular),
     )
+
+
+def _product(matrix: chex.Array, vector: chex.Array) -> chex.Array:
+    """[3, 3], [3] -> [3], exact on a GPU too, unlike a matrix product."""
+    return jnp.sum(matrix * vector, axis=-1)
+
+
+def _solve(matrix: chex.Array, vector: chex.Array) -> chex.Array:
+    """matrix⁻¹·vector of a symmetric [3, 3], by Cramer's rule; [3]."""
+    a, b, c = matrix
+    adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
+    return _product(adjugate, vector) / jnp.sum(a * adjugate[0])
 
 
 def step(physics: Physics, body: Body, thrust: chex.Array, dt_s: float) -> Body:
     """One control period under constant thrust [4] [N], by semi-implicit Euler: twist first, then pose."""
     body = integrate.semi_implicit_euler(lambda b: derivative(physics, b, thrust), body, dt_s)
     return body._replace(pose=body.pose._replace(attitude=rotation.normalize(body.pose.attitude)))
-
-
-def step_rk4(physics: Physics, body: Body, thrust: chex.Array, dt_s: float, substeps: int) -> Body:
-    """One control period under constant thrust [4] [N], by RK4 in equal substeps: more accurate than `step`."""
-
-    def substep(_: int, body: Body) -> Body:
-        body = integrate.rk4(lambda b: derivative(physics, b, thrust), body, dt_s / substeps)
-        return body._replace(pose=body.pose._replace(attitude=rotation.normalize(body.pose.attitude)))
-
-    return jax.lax.fori_loop(0, substeps, substep, body)
 
 
 def observe(body: Body) -> chex.Array:

@@ -13,7 +13,8 @@ import numpy as np
 
 from qrl_envs.quadrotor import Physics
 
-SAME_M = 1e-6  # greatest distance between a transformed motor and the motor it coincides with
+SAME_M = 1e-6  # greatest difference of torque per thrust between a transformed motor and the one it coincides with
+SAME_INERTIA = 1e-6  # likewise, of the moments of inertia, as a fraction of the largest
 
 
 class Symmetry(NamedTuple):
@@ -64,14 +65,23 @@ def _sample_vehicle_symmetry(physics: Physics, candidates: np.ndarray, u: chex.A
 
 
 def _motor_permutation(physics: Physics, body: chex.Array) -> tuple[chex.Array, chex.Array]:
-    """The permutation [A, A] of motors under a map of the body, and whether the map is a symmetry of the vehicle."""
-    moved = jnp.sum(physics.motor_position_m[:, None] * body[:2, :2], axis=-1)  # exact, unlike a GPU's matrix product
-    distance = jnp.abs(physics.motor_position_m[:, None] - moved[None]).max(axis=-1)
-    spin = _determinant(body) * physics.motor_spin
-    equal = (physics.motor_spin[:, None] == spin) & (physics.motor_max_N[:, None] == physics.motor_max_N)
+    """The permutation [A, A] of motors under a map of the body, and whether the map is a symmetry of the vehicle.
+
+    A motor is where another was if it has the other's force (a vector) and torque (a pseudovector).
+    """
+    torque = physics.motor_torque_m
+    moved = _determinant(body) * jnp.sum(body[:, :, None] * torque[None], axis=1)  # exact, unlike a matrix product
+    distance = jnp.abs(torque[:, :, None] - moved[:, None]).max(axis=0)
+    if physics.motor_axis is not None:
+        axes = jnp.sum(body[:, :, None] * physics.motor_axis[None], axis=1)
+        distance = jnp.maximum(distance, jnp.abs(physics.motor_axis[:, :, None] - axes[:, None]).max(axis=0))
+    equal = physics.motor_max_N[:, None] == physics.motor_max_N
     motors = ((distance < SAME_M) & equal).astype(jnp.float32)
     bijective = jnp.all(motors.sum(axis=0) == 1.0) & jnp.all(motors.sum(axis=1) == 1.0)
-    return motors, bijective & jnp.all(jnp.sum(body**2 * physics.inertia_kg_m2, axis=-1) == physics.inertia_kg_m2)
+    inertia = physics.inertia_kg_m2
+    matrix = jnp.diag(inertia) if inertia.ndim == 1 else inertia
+    turned = jnp.sum((body @ matrix)[:, None] * body[None], axis=-1)
+    return motors, bijective & jnp.all(jnp.abs(turned - matrix) <= SAME_INERTIA * jnp.max(matrix))
 
 
 def _observation(world: chex.Array, body: chex.Array) -> chex.Array:

@@ -4,14 +4,17 @@
 x forward, y left, z up.
 """
 
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
+from qrl_envs.uncertainty import Uncertainty, shipped_uncertainties, uncertainty_data
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle, shipped_vehicles, vehicle_data, with_default_scale
 
 
@@ -33,6 +36,24 @@ class Bounds(Spec):
 
     distance_m: Positive
     body_rate_rad_s: Positive
+
+
+class Integral(Spec):
+    """The integral of the position error as an observation; far from the target, where it would wind up, it stands.
+
+    dI/dt = p·max(0, 1 − |p|²/radius_m²)², within ±limit_m_s for each axis. In hover p is the position; on a circle the
+    height alone, which is all that firmware can tell of the error without knowing the circle.
+    """
+
+    radius_m: Positive = 0.5
+    limit_m_s: Positive = 0.6
+
+
+class Memory(Spec):
+    """What a policy observes beside measurements; the environment keeps it, and in flight the exported kernel."""
+
+    previous_action: bool = False
+    integral: Integral | None = None
 
 
 class HoverReward(Spec):
@@ -63,6 +84,7 @@ class CircleReward(Spec):
         return self
 
 
+FULL_MEMORY = {"previous_action": True, "integral": {}}
 W5_RADIUS_S_M = 0.5  # w5 of the 1 m circle
 
 FlightReward = Annotated[HoverReward | CircleReward, Field(discriminator="form")]
@@ -107,6 +129,8 @@ class QuadrotorTask(Spec):
     control_period_s: Positive
     episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
+    uncertainty: Uncertainty | None = None  # in a file by default "default" for a vehicle with lag or drag
+    memory: Memory = Memory()  # in a file by default all of it for such a vehicle
     start: FlightStart
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
     bounds: Bounds
@@ -148,6 +172,11 @@ class QuadrotorTask(Spec):
     @property
     def episode_steps(self) -> int:
         return max(1, round(self.episode_s / self.control_period_s))
+
+    @property
+    def ideal(self) -> bool:
+        """Whether this is the paper's world: thrust at once, no drag, nothing uncertain, no memory."""
+        return self.vehicle.ideal and self.uncertainty is None and self.memory == Memory()
 
     def warnings(self) -> list[str]:
         """What is accepted and may not work, in one line each."""
@@ -214,7 +243,7 @@ class PendulumTask(Spec):
 Task = QuadrotorTask | PendulumTask
 
 # The fields whose numbers are arguments of a compiled program (env.Params); the other fields shape the program.
-TRACED = ("vehicle", "rod", "start", "bounds", "reward")
+TRACED = ("vehicle", "uncertainty", "rod", "start", "bounds", "reward")
 _ANY_TASK = Annotated[Task, Field(discriminator="world")]
 
 
@@ -227,43 +256,50 @@ def shipped() -> list[str]:
     )
 
 
+# Parts of a task that may be a file of their own: what reads them, and the names of those that are shipped.
+_PARTS = {"vehicle": (vehicle_data, shipped_vehicles), "uncertainty": (uncertainty_data, shipped_uncertainties)}
+
+
 def _shipped(name: str) -> dict[str, Any]:
     data = extended(specfile.read(Path(str(resources.files("qrl_envs").joinpath("tasks", f"{name}.json")))), name)
     return data | {"vehicle": vehicle_data(named)} if isinstance(named := data.get("vehicle"), str) else data
 
 
-def load(name_or_path: str, vehicle: str | None = None) -> Task:
-    """The task of a shipped name or of a `.json` file, with the `vehicle` of that name or file where one is given.
+def load(name_or_path: str, vehicle: str | None = None, uncertainty: str | None = None) -> Task:
+    """The task of a shipped name or of a `.json` file, with the `vehicle` and the `uncertainty` of that name or file
+    where one is given.
 
     Raises BadInput with a message of one line.
     """
+    parts = {"vehicle": vehicle, "uncertainty": uncertainty}
     if name_or_path in shipped():
-        return from_data(_shipped(name_or_path), name_or_path, vehicle=vehicle)
+        return from_data(_shipped(name_or_path), name_or_path, parts=parts)
     if name_or_path.endswith(".json"):
         path = Path(name_or_path)
-        return from_data(specfile.read(path), name_or_path, path.parent, vehicle)
+        return from_data(specfile.read(path), name_or_path, path.parent, parts)
     raise BadInput(f"unknown task '{name_or_path}'{specfile.nearest(name_or_path, shipped())}")
 
 
-def from_data(data: dict[str, Any], where: str, folder: Path = Path(), vehicle: str | None = None) -> Task:
+def from_data(
+    data: dict[str, Any], where: str, folder: Path = Path(), parts: Mapping[str, str | None] = MappingProxyType({})
+) -> Task:
     """The task of a JSON object, which may `extend` a shipped task; error messages begin with `where`.
 
-    Its key `vehicle` may be an object, a shipped vehicle's name or a `.json` path, from `folder` on; the argument
-    `vehicle`, a name or path, replaces it.
+    Its keys `vehicle` and `uncertainty` may each be an object, a shipped name or a `.json` path, from `folder` on;
+    `parts`, names or paths by key, replace them.
     """
     data = extended(data, where)
-    named = data.get("vehicle")
-    if vehicle is not None:
-        if data.get("world") != "quadrotor":
-            raise BadInput(f"{where}: has no vehicle to replace by '{vehicle}'")
-        data = {**data, "vehicle": vehicle_data(vehicle)}
-        where = f"{where} with vehicle {vehicle}"
-    elif isinstance(named, str):
-        path = named if named in shipped_vehicles() else str(folder / named)
-        try:
-            data = {**data, "vehicle": vehicle_data(path)}
-        except BadInput as error:
-            raise BadInput(f"{where}: key 'vehicle': {error}") from None
+    for key, (read, known) in _PARTS.items():
+        if (asked := parts.get(key)) is not None:
+            if data.get("world") != "quadrotor":
+                raise BadInput(f"{where}: has no {key} to replace by '{asked}'")
+            data = {**data, key: read(asked)}
+            where = f"{where} with {key} {asked}"
+        elif isinstance(named := data.get(key), str):
+            try:
+                data = {**data, key: read(named if named in known() else str(folder / named))}
+            except BadInput as error:
+                raise BadInput(f"{where}: key '{key}': {error}") from None
     return specfile.build(_ANY_TASK, _completed(data), where)
 
 
@@ -285,7 +321,17 @@ def _completed(data: dict[str, Any]) -> dict[str, Any]:
         reward: Any = part.get("reward") if isinstance(part, dict) else None
         if isinstance(part, dict) and isinstance(reward, dict) and _positive(reward.get("radius_m")):
             part["reward"] = {"w5_direction_s_m2": W5_RADIUS_S_M / reward["radius_m"]} | reward
-    return data | {"vehicle": with_default_scale(data["vehicle"])} if "vehicle" in data else data
+    if "vehicle" not in data:
+        return data
+    vehicle = with_default_scale(data["vehicle"])
+    data |= {"vehicle": vehicle}
+    if isinstance(vehicle, dict) and (vehicle.get("rotor_rise_s") or any(_listed(vehicle.get("drag_N_s_m")))):
+        data = {"uncertainty": uncertainty_data("default"), "memory": FULL_MEMORY} | data
+    return data
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, list | tuple) else []
 
 
 def extended(data: dict[str, Any], where: str) -> dict[str, Any]:

@@ -2,13 +2,13 @@
 
 from importlib import resources
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.specfile import BadInput, Positive, Real, Spec
+from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
 
 STANDARD_GRAVITY_M_S2 = 9.81
 INERTIA_TOLERANCE = 0.05  # measured inertias are rounded: excess over a rigid body's bound that is accepted
@@ -16,31 +16,62 @@ MOST_ARM_PER_GYRATION = 30.0  # distance of a motor per radius of gyration, abov
 LEAST_ANGULAR_ACCELERATION_RAD_S2 = 3.0  # about x and y, below which a vehicle can only just be rotated
 LEAST_YAW_ACCELERATION_RAD_S2 = 0.3
 RECOVERY_M = 2.0
+LEAST_AXIS = 1e-3  # length
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover
 
 
 class Motor(Spec):
-    position_m: tuple[Real, Real]  # x, y from the center of mass, body frame
-    spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about body z
+    position_m: tuple[Real, Real] | tuple[Real, Real, Real]  # x, y (, z) from the center of mass, body frame
+    axis: tuple[Real, Real, Real] = (0.0, 0.0, 1.0)  # direction of its thrust, body frame, of any length
+    spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about its axis
     max_N: Positive
+    min_N: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _limits(self) -> "Motor":
+        if self.min_N >= self.max_N:
+            raise ValueError(f"expected min_N below max_N, found {self.min_N:g} and {self.max_N:g}")
+        if np.linalg.norm(self.axis) < LEAST_AXIS:
+            raise ValueError(f"expected an axis that points somewhere, found {self.axis}")
+        return self
 
 
 class Vehicle(Spec):
-    """A quadrotor; a file that cannot fly is refused with the reason. `warnings` tells what can only just fly."""
+    """A multirotor; a file that cannot fly is refused with the reason. `warnings` tells what can only just fly.
 
+    With `rotor_rise_s` and `rotor_fall_s` 0 thrust follows its command at once, as in the paper; else each rotor's
+    speed follows its set-point with that time constant, and thrust is a curve of speed.
+    """
+
+    source: str = ""  # where the numbers are from
     mass_kg: Positive
-    inertia_kg_m2: tuple[Positive, Positive, Positive]  # principal, about body x, y, z
-    motors: tuple[Motor, Motor, Motor, Motor]
+    # About the center of mass, body axes: xx, yy, zz, or xx, yy, zz, xy, xz, yz (the products as they stand in the
+    # matrix, so xy is −∫xy dm).
+    inertia_kg_m2: tuple[Positive, Positive, Positive] | tuple[Positive, Positive, Positive, Real, Real, Real]
+    motors: Annotated[tuple[Motor, ...], Field(min_length=3, max_length=8)]
     yaw_moment_m: Positive  # reaction torque per thrust: N m per N
     action_scale_N: Positive  # F_pi = action_scale_N · a
+    rotor_rise_s: NonNegative = 0.0  # time constant of a rotor's speed when it is to rise
+    rotor_fall_s: NonNegative = 0.0
+    thrust_curve: Annotated[float, Field(ge=-0.9, le=1.0)] = 0.0  # c of thrust/max_N = c·w + (1 − c)·w², w the speed
+    drag_N_s_m: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)  # linear, along body x, y, z
 
     @model_validator(mode="after")
     def _can_fly(self) -> "Vehicle":
-        x, y, z = self.inertia_kg_m2
+        if (self.rotor_rise_s == 0.0) != (self.rotor_fall_s == 0.0):
+            raise ValueError(
+                "expected rotor_rise_s and rotor_fall_s above 0, or both 0 for rotors without lag, found"
+                f" {self.rotor_rise_s:g} and {self.rotor_fall_s:g}"
+            )
+        moments = np.linalg.eigvalsh(self.inertia_matrix_kg_m2)
+        if moments[0] <= 0.0:
+            raise ValueError("expected inertia_kg_m2 of a rigid body: its matrix is not positive definite")
+        x, y, z = self.inertia_kg_m2[:3] if len(self.inertia_kg_m2) == 3 else map(float, moments)
         greatest = max(x, y, z)
         if greatest > (x + y + z - greatest) * (1 + INERTIA_TOLERANCE):  # equal: a flat plate
             raise ValueError(
-                f"expected inertia_kg_m2 of a rigid body: no moment above the sum of the other two, found {x}, {y}, {z}"
+                "expected inertia_kg_m2 of a rigid body: no principal moment above the sum of the other two, found"
+                f" {x:.6g}, {y:.6g}, {z:.6g}"
             )
         weight = self.mass_kg * STANDARD_GRAVITY_M_S2
         if self.total_thrust_N <= weight:
@@ -48,26 +79,34 @@ class Vehicle(Spec):
                 f"expected motors that can lift the vehicle, found {self.total_thrust_N:.4g} N of thrust"
                 f" for {weight:.4g} N of weight"
             )
-        arm, gyration = np.abs(self._wrenches[1:3]).max(), np.sqrt(max(x, y, z) / self.mass_kg)
+        arm, gyration = np.linalg.norm(self.motor_positions_m, axis=0).max(), np.sqrt(max(x, y, z) / self.mass_kg)
         if arm > MOST_ARM_PER_GYRATION * gyration:
             raise ValueError(
                 f"expected motors.position_m in meters: a motor at {arm:.4g} m does not fit a vehicle whose inertia is"
                 f" that of its mass at {gyration:.2g} m"
             )
-        for axis, torques in zip("xyz", self._wrenches[1:], strict=True):
+        for axis, torques in zip("xyz", self.torques_m, strict=True):
             if np.all(torques == 0.0) or (axis != "z" and np.ptp(torques) == 0.0):
                 raise ValueError(f"expected motors that can turn the vehicle about body {axis}; these have no torque")
         hover = self.hover_thrusts_N
-        if not np.allclose(self._wrenches @ hover, [weight, 0, 0, 0], atol=1e-6 * weight) or hover.min() < 0.0:
+        force = np.linalg.norm(self.motor_axes @ hover)
+        torque = np.abs(self.torques_m @ hover).max()
+        if abs(force - weight) > 1e-6 * weight or torque > 1e-6 * weight * arm or hover.min() < 0.0:
             raise ValueError(
-                "expected motors around the center of mass: level hover would take"
+                "expected motors around the center of mass: hover would take"
                 f" {', '.join(f'{f:.3g}' for f in hover)} N, and no motor can pull down"
             )
         over = [i for i, motor in enumerate(self.motors) if hover[i] > motor.max_N]
         if over:
             raise ValueError(
-                f"expected motors that can hover level: motor {over[0] + 1} would need {hover[over[0]]:.3g} N, and has"
+                f"expected motors that can hover: motor {over[0] + 1} would need {hover[over[0]]:.3g} N, and has"
                 f" {self.motors[over[0]].max_N:.3g} N"
+            )
+        under = [i for i, motor in enumerate(self.motors) if hover[i] < motor.min_N]
+        if under:
+            raise ValueError(
+                f"expected motors that can hover: motor {under[0] + 1} would need {hover[under[0]]:.3g} N, and its"
+                f" min_N is {self.motors[under[0]].min_N:.3g} N"
             )
         roll, pitch, _ = self.angular_acceleration_rad_s2
         if min(roll, pitch) < LEAST_ANGULAR_ACCELERATION_RAD_S2:
@@ -82,38 +121,69 @@ class Vehicle(Spec):
         return sum(motor.max_N for motor in self.motors)
 
     @property
-    def _wrenches(self) -> np.ndarray:
-        """Lift and torque about x, y, z per thrust of each motor; [4, motors]."""
-        x, y = np.array([motor.position_m for motor in self.motors]).T
+    def ideal(self) -> bool:
+        """Whether thrust follows its command at once, without drag: the paper's world."""
+        return self.rotor_rise_s == 0.0 and not any(self.drag_N_s_m)
+
+    @property
+    def inertia_matrix_kg_m2(self) -> np.ndarray:
+        """[3, 3], float64."""
+        xx, yy, zz, xy, xz, yz = (*self.inertia_kg_m2, 0.0, 0.0, 0.0)[:6]
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+    @property
+    def motor_positions_m(self) -> np.ndarray:
+        """[3, motors], body frame."""
+        return np.array([(*motor.position_m, 0.0)[:3] for motor in self.motors]).T
+
+    @property
+    def motor_axes(self) -> np.ndarray:
+        """Unit vectors along which thrust acts, body frame; [3, motors]."""
+        axes = np.array([motor.axis for motor in self.motors]).T
+        return axes / np.linalg.norm(axes, axis=0)
+
+    @property
+    def torques_m(self) -> np.ndarray:
+        """Torque about body x, y, z per thrust of each motor; [3, motors]."""
         spin = np.array([motor.spin for motor in self.motors])
-        return np.stack([np.ones(len(self.motors)), y, -x, self.yaw_moment_m * spin])
+        axes = self.motor_axes
+        return np.cross(self.motor_positions_m, axes, axis=0) + self.yaw_moment_m * spin * axes
 
     @property
     def hover_thrusts_N(self) -> np.ndarray:
         """F_o of each motor: the thrusts of least norm that carry the weight without torque; mg/4 where the center of
         mass is in the middle (paper, equ:forceOutput). [motors], float64.
+
+        Along body z where the motors can; else along their mean axis, about which the vehicle then hovers tilted.
         """
-        wrenches = self._wrenches
+        weight = self.mass_kg * STANDARD_GRAVITY_M_S2
+        wrenches = np.concatenate([self.motor_axes, self.torques_m])
         scale = np.abs(wrenches).max(axis=1, keepdims=True)
-        scaled = wrenches / np.where(scale > 0, scale, 1.0)
-        return np.linalg.pinv(scaled) @ np.array([self.mass_kg * STANDARD_GRAVITY_M_S2, 0.0, 0.0, 0.0])
+        rows = scale[:, 0] > 0
+        inverse = np.linalg.pinv(wrenches[rows] / scale[rows])
+        mean_axis = self.motor_axes.sum(axis=1)
+        for direction in (np.array([0.0, 0.0, 1.0]), mean_axis / max(np.linalg.norm(mean_axis), LEAST_AXIS)):
+            wanted = np.concatenate([weight * direction, np.zeros(3)])[rows] / scale[rows, 0]
+            thrusts = inverse @ wanted
+            if np.allclose(self.motor_axes @ thrusts, weight * direction, atol=1e-6 * weight):
+                break
+        return thrusts
 
     @property
     def angular_acceleration_rad_s2(self) -> np.ndarray:
         """The greatest angular acceleration about body x, y, z by actions in [−1, 1] from hover; [3]."""
         hover = self.hover_thrusts_N
-        high = np.array([motor.max_N for motor in self.motors])
-        up, down = np.minimum(self.action_scale_N, high - hover), np.minimum(self.action_scale_N, hover)
-        torques = self._wrenches[1:]
-        torque = np.where(torques > 0, torques * up, -torques * down).sum(axis=1)
-        return torque / np.array(self.inertia_kg_m2)
+        high, low = (np.array([getattr(motor, name) for motor in self.motors]) for name in ("max_N", "min_N"))
+        up, down = np.minimum(self.action_scale_N, high - hover), np.minimum(self.action_scale_N, hover - low)
+        rotations = np.linalg.solve(self.inertia_matrix_kg_m2, self.torques_m)
+        return np.where(rotations > 0, rotations * up, -rotations * down).sum(axis=1)
 
     @property
     def recovery_s(self) -> float:
         """Estimated time to turn upright from upside down, then to move RECOVERY_M and stop: its time scale."""
         high = np.minimum(self.hover_thrusts_N + self.action_scale_N, [motor.max_N for motor in self.motors])
         surplus = high.sum() / self.mass_kg - STANDARD_GRAVITY_M_S2
-        turn = 2.0 * (np.pi / self.angular_acceleration_rad_s2[:2].min()) ** 0.5
+        turn = 2.0 * (np.pi / self.angular_acceleration_rad_s2[:2].min()) ** 0.5 + self.rotor_rise_s + self.rotor_fall_s
         return float(turn + 2.0 * (RECOVERY_M / max(surplus, 0.05 * STANDARD_GRAVITY_M_S2)) ** 0.5)
 
     def warnings(self) -> list[str]:
@@ -125,7 +195,7 @@ class Vehicle(Spec):
                 f"thrust is {ratio:.2f} of the weight: it can only just hover, and cannot recover from most attitudes;"
                 " start.tilt_rad limits those of the starts"
             )
-        if np.linalg.matrix_rank(self._wrenches[1:] / np.abs(self._wrenches[1:]).max(axis=1, keepdims=True)) < 3:
+        if np.linalg.matrix_rank(self.torques_m / np.abs(self.torques_m).max(axis=1, keepdims=True)) < 3:
             found.append("its motors cannot turn it about all axes independently: check motors.spin")
         if (yaw := self.angular_acceleration_rad_s2[2]) < LEAST_YAW_ACCELERATION_RAD_S2:
             found.append(f"it can hardly turn about body z ({yaw:.2g} rad/s²): check yaw_moment_m, N m per N of thrust")

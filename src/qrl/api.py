@@ -113,6 +113,7 @@ def train(
     seed: int = 0,
     out: str | Path | None = None,
     *,
+    uncertainty: str | Path | None = None,
     preset: str | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -124,6 +125,7 @@ def train(
     vehicle: a shipped vehicle's name or a path to a .json, in place of the task's own
     config: a Config, or a config.json, whole or in part
     out: the run folder, by default runs/TASK
+    uncertainty: what differs from flight to flight, a shipped name or a path to a .json, in place of the task's own
     preset: hyperparameters by name, in place of the task's preset; not together with a Config, which has them all
     resume: continue the run that the folder holds; one that is complete is loaded
     quiet: print nothing
@@ -132,18 +134,21 @@ def train(
     Raises BadInput, in one line, where the input is wrong; NotFinite where training diverges.
     """
     _configure_jax()
-    named = str(vehicle) if vehicle is not None else None
+    parts = {
+        key: None if value is None else str(value)
+        for key, value in (("vehicle", vehicle), ("uncertainty", uncertainty))
+    }
     if isinstance(config, Config):
         if preset is not None:
             raise BadInput("qrl.train: expected preset or a Config, found both: a Config has all hyperparameters")
         hyperparameters, config = config.model_dump() | _checked(hyperparameters), None
     flags = {f"learner.{name}": value for name, value in _checked(hyperparameters).items()}
-    folder = Path(out) if out else Path("runs") / tasks.folder_name(tasks.task_record(str(task), named))
+    folder = Path(out) if out else Path("runs") / tasks.folder_name(tasks.task_record(str(task), parts))
     if not resume and (folder / "config.json").exists():
         raise BadInput(f"{folder}: holds a run already; give another out, or resume=True to resume it")
     request = argparse.Namespace(
         task=str(task),
-        vehicle=named,
+        **parts,
         config=Path(config) if config else None,
         seed=_valid("seed", CountOrZero, seed),
         seeds=1,

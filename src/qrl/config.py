@@ -52,6 +52,7 @@ class Hyperparameters(NamedTuple):
     max_grad_norm: Any
     sigma: Any
     sigma_end: Any
+    apg_cotangent_norm: Any
     apg_learning_rate: Any
     gamma: Any
     lam: Any
@@ -113,6 +114,10 @@ class Config(BaseModel):
     )
     apg_num_envs: Static[Count] = Field(description="flights of one APG update")
     apg_episode_length: Static[Count] = Field(description="steps of one APG flight")
+    apg_cotangent_norm: Traced[Positive | None] = Field(
+        description="norm at which the gradient of a flight's return with respect to its state is cut at each step;"
+        " null: none"
+    )
     apg_learning_rate: Traced[Positive] = Field(description="initial step size of APG; decays to 0, as sigma then does")
 
     gamma: Traced[Fraction] = Field(description="discount")

@@ -1,6 +1,8 @@
 """From what the user asked (task, flags, CONFIG, run folder) to a run that can start; BadInput if it cannot."""
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from qrl import tasks
@@ -33,22 +35,23 @@ def run_config(
     flags: dict[str, Any],
     seed: int | None,
     seeds: int | None,
-    vehicle: str | None = None,
+    parts: Mapping[str, str | None] = MappingProxyType({}),
     preset: str | None = None,
 ) -> RunConfig:
     """The run asked for: flags over CONFIG (`file`, read from `config`) over `preset`, or the task's, over the default.
 
-    It names no devices yet: JAX has not been asked for them.
+    `parts`: names or paths of the task's vehicle and uncertainty, in place of its own. The run names no devices yet:
+    JAX has not been asked for them.
     """
     record = file.task
     assert not isinstance(record, str)  # config_file saw to it
     if task:
-        asked = tasks.task_record(task, vehicle)
+        asked = tasks.task_record(task, parts)
         if record and record != asked:
             raise BadInput(f"{config}: key 'task': expected the task asked for, '{task}', found '{record.name}'")
         record = asked
-    elif vehicle:
-        raise BadInput("--vehicle: expected a TASK to fly it")
+    elif given := next((name for name, value in parts.items() if value is not None), None):
+        raise BadInput(f"--{given}: expected a TASK too")
     if not record:
         raise BadInput(f"no task given (known: {', '.join(shipped())}; all: qrl tasks)")
     run = RunConfig(

@@ -5,8 +5,9 @@ import importlib
 import io
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any
 
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.types import Env
-from qrl.config import Config, load_preset
+from qrl.config import Config, load_preset, preset_names
 from qrl.runs.record import RunConfig, TaskRecord, with_current_names
 from qrl_envs import env as worlds
 from qrl_envs import specfile
@@ -38,13 +39,15 @@ def foreign_tasks() -> list[str]:
     return sorted(set(_brax_envs()._envs) - set(task_spec.shipped()))  # Brax offers no public list
 
 
-def task_record(name: str, vehicle: str | None = None) -> TaskRecord:
+def task_record(name: str, parts: Mapping[str, str | None] = MappingProxyType({})) -> TaskRecord:
     """The task of a shipped name, a `.json` path, one of Brax's names, or "module:factory"; of a task of our own worlds
-    with the `vehicle` of that name or file, where one is given.
+    with other `parts`, a vehicle and an uncertainty, by name or file.
     """
+    asked = {key: value for key, value in parts.items() if value is not None}
     own = name in task_spec.shipped() or name.endswith(".json")
-    if vehicle is not None and not own:
-        raise BadInput(f"task '{name}': has no vehicle to replace by '{vehicle}'")
+    for key, value in asked.items():
+        if not own:
+            raise BadInput(f"task '{name}': has no {key} to replace by '{value}'")
     if ":" in name and not name.endswith(".json"):
         _call_factory(name)
         return TaskRecord(name=name, spec=None)
@@ -52,8 +55,8 @@ def task_record(name: str, vehicle: str | None = None) -> TaskRecord:
         if name in foreign_tasks():
             return TaskRecord(name=name, spec=None)
         raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*task_spec.shipped(), *foreign_tasks()])}")
-    spec = task_spec.load(name, vehicle).model_dump(mode="json", exclude_none=True)
-    stem = Path(name).stem + (f"_{Path(vehicle).stem}" if vehicle else "")
+    spec = task_spec.load(name, **asked).model_dump(mode="json", exclude_none=True)
+    stem = "_".join(Path(part).stem for part in (name, *asked.values()))
     return TaskRecord(name=_folder(stem, name), spec=spec)
 
 
@@ -144,8 +147,12 @@ def task_preset(record: TaskRecord, where: str, name: str | None = None) -> dict
     """The learner's defaults for a task, which `where` names: its preset, or that of `name`, carried over to it."""
     if record.spec is None:
         return preset(name or "default", where)
-    values = preset(name or record.spec["preset"], where if name else f"{where}: the task's key 'preset'")
-    return _carried_over(values, spec(record))
+    task = spec(record)
+    named = record.spec["preset"]
+    if isinstance(task, task_spec.QuadrotorTask) and not task.ideal and f"{named}_real" in preset_names():
+        named = f"{named}_real"
+    values = preset(name or named, where if name else f"{where}: the task's key 'preset'")
+    return _carried_over(values, task)
 
 
 def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any]:
@@ -162,13 +169,26 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
         longer = min(4, 2 ** max(0, round(np.log2(slower))))
         flights = max(values["apg_num_envs"] // longer, 8)
         values |= {"apg_episode_length": values["apg_episode_length"] * longer, "apg_num_envs": flights}
+        if not task.ideal and values["observation_scale"]:
+            values["observation_scale"] = [*values["observation_scale"], *_memory_scale(task)]
     reward = task.reward
     if isinstance(reward, task_spec.CircleReward) and values["observation_scale"]:
         length, speed = max(1.0, reward.radius_m), max(1.0, abs(reward.speed_m_s) / 2.0)
-        rotation, position, velocity, rates = np.split(np.array(values["observation_scale"]), [9, 12, 15])
-        scale = np.concatenate([rotation, position / length, velocity / speed, rates])
+        rotation, position, velocity, other = np.split(np.array(values["observation_scale"]), [9, 12, 15])
+        scale = np.concatenate([rotation, position / length, velocity / speed, other])
         values |= {"observation_scale": scale.tolist(), "reward_scaling": values["reward_scaling"] / length}
     return values
+
+
+INTEGRAL_SCALE_1_M_S = 6.0
+
+
+def _memory_scale(task: task_spec.QuadrotorTask) -> list[float]:
+    """Scales of what an environment of a real vehicle observes beside the 18 numbers of the paper's."""
+    size = worlds.from_task(task).observation_size - 18
+    motors = len(task.vehicle.motors) * task.memory.previous_action
+    integral = 3 * (task.memory.integral is not None)
+    return [1.0] * motors + [INTEGRAL_SCALE_1_M_S] * integral + [1.0] * (size - motors - integral)
 
 
 def check(env: Env, learner: Config, where: str) -> None:

@@ -12,10 +12,10 @@ from qrl_envs.vehicle import Vehicle
 class Mixer(NamedTuple):
     """A vehicle's motors, NumPy in float32. Forces in N, torques in N m about body x, y, z."""
 
-    thrust_per_wrench: np.ndarray  # [4 motors, 4]: per lift, and per torque about x, y, z
-    low_N: np.ndarray  # [4] limits of the thrust that actions command
-    high_N: np.ndarray  # [4]
-    hover_N: np.ndarray  # [4] thrusts of hover
+    thrust_per_wrench: np.ndarray  # [motors, 4]: per lift, and per torque about x, y, z
+    low_N: np.ndarray  # [motors] limits of the thrust that actions command
+    high_N: np.ndarray  # [motors]
+    hover_N: np.ndarray  # [motors] thrusts of hover
     action_scale_N: np.ndarray  # []
 
     @property
@@ -34,13 +34,12 @@ class Mixer(NamedTuple):
 
 def mixer(vehicle: Vehicle) -> Mixer:
     """The mixer of a vehicle: the pseudo-inverse of the map from motor thrusts to lift and torque."""
-    x, y = np.array([motor.position_m for motor in vehicle.motors]).T
-    spin, max_N = np.array([(motor.spin, motor.max_N) for motor in vehicle.motors]).T
-    wrench_per_thrust = np.stack([np.ones(4), y, -x, vehicle.yaw_moment_m * spin])
+    min_N, max_N = np.array([(motor.min_N, motor.max_N) for motor in vehicle.motors]).T
+    wrench_per_thrust = np.concatenate([vehicle.motor_axes[2:], vehicle.torques_m])
     hover = vehicle.hover_thrusts_N
     numbers = (
         np.linalg.pinv(wrench_per_thrust),
-        np.maximum(hover - vehicle.action_scale_N, 0.0),
+        np.maximum(hover - vehicle.action_scale_N, min_N),
         np.minimum(hover + vehicle.action_scale_N, max_N),
         hover,
         vehicle.action_scale_N,
@@ -49,7 +48,7 @@ def mixer(vehicle: Vehicle) -> Mixer:
 
 
 def action(mixer: Mixer, lift_N: chex.Array, torque_N_m: chex.Array, lift_error_N: float) -> chex.Array:
-    """The action [4] in [−1, 1] for a lift [] [N] above the hover thrust and a torque [3] [N m].
+    """The action [motors] in [−1, 1] for a lift [] [N] above the hover thrust and a torque [3] [N m].
 
     When motors saturate, torque about x and y comes first, as long as it changes the lift by at most `lift_error_N`;
     then lift; then torque about z, for which the motors are weakest and the need is least.

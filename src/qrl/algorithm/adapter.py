@@ -9,7 +9,7 @@ from qrl.algorithm.types import Env, Evaluation, State, Symmetry, TaskEnv
 BRAX_EPISODE_STEPS = 1000  # Brax's customary episode length
 
 _ABILITIES = (
-    *("params", "episode_steps", "control_period_s", "differentiable"),
+    *("params", "policy_observation_size", "episode_steps", "control_period_s", "differentiable"),
     *("with_params", "restart", "reset_calibration", "symmetry", "evaluation"),
 )
 
@@ -26,6 +26,7 @@ class _Adapted:
                 setattr(self, name, getattr(env, name))
 
     params: Any = ()
+    policy_observation_size: int | None = None
     episode_steps: int = BRAX_EPISODE_STEPS
     differentiable: bool = False  # not known
 

@@ -18,12 +18,44 @@ from qrl.config import Hyperparameters
 Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [..., A]
 
 
-def returns(env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: int) -> tuple[chex.Array, chex.Array]:
+@jax.custom_vjp
+def _bounded(tree: chex.ArrayTree, limit: chex.Array) -> chex.ArrayTree:
+    """`tree`, with leading axis n; on the way back the norm of each of the n cotangents is at most `limit`."""
+    del limit
+    return tree
+
+
+def _bounded_forward(tree: chex.ArrayTree, limit: chex.Array) -> tuple[chex.ArrayTree, chex.Array]:
+    return tree, limit
+
+
+def _bounded_backward(limit: chex.Array, cotangent: chex.ArrayTree) -> tuple[chex.ArrayTree, None]:
+    leaves = [x for x in jax.tree.leaves(cotangent) if x.dtype != jax.dtypes.float0]
+    square = sum(jnp.sum(x.reshape(x.shape[0], -1) ** 2, axis=1) for x in leaves)
+    factor = jnp.where(jnp.isfinite(square), jnp.minimum(1.0, limit * jax.lax.rsqrt(square + 1e-20)), 0.0)
+
+    def scaled(x: chex.Array) -> chex.Array:
+        if x.dtype == jax.dtypes.float0:
+            return x
+        each = factor.reshape(-1, *[1] * (x.ndim - 1))
+        return jnp.where(each > 0.0, x * each, 0.0)
+
+    return jax.tree.map(scaled, cotangent), None
+
+
+_bounded.defvjp(_bounded_forward, _bounded_backward)
+
+
+def returns(
+    env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: int, cotangent_norm: chex.Array | None = None
+) -> tuple[chex.Array, chex.Array]:
     """For each of `keys` [n] a flight of `steps` from a fresh start: sum of its rewards, and whether it is complete.
 
     Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not complete. It is held where
     it ended, since what overflows has no gradient, and is charged for the steps that are left: the last reward each, or
-    0 if that was above 0 and the flight was not out of bounds. So ending never pays.
+    0 if that was above 0 and the flight was not out of bounds. So ending never pays. With `cotangent_norm` the gradient
+    of a flight's return with respect to its state after any step is cut to that norm: long flights of a lagged vehicle
+    are chaotic, and a few of them would drown all others.
     """
 
     def one(key: chex.PRNGKey) -> tuple[State, chex.Array]:
@@ -38,6 +70,8 @@ def returns(env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: 
         held = jax.tree.map(
             lambda new, old: jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)) > 0, new, old), after, state
         )
+        if cotangent_norm is not None:
+            held = held.replace(pipeline_state=_bounded(held.pipeline_state, cotangent_norm))
         return (held, alive * (1.0 - after.done)), reward
 
     states, noise = jax.vmap(one)(keys)

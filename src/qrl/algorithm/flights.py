@@ -32,8 +32,8 @@ def fly(
     """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
 
     An environment with an `evaluation` is flown and measured as that says, another for one episode of
-    `max_episode_steps`. `reset` draws the starts. The policy sees `info["sensor_obs"]`, if present; the
-    measures see the true observation. A flight that ends early has no more observations: its NaNs make it a failure.
+    `max_episode_steps`. `reset` draws the starts. What is recorded and measured is `info["true_obs"]`, if present, while
+    the policy sees the observation. A flight that ends early has no more observations: its NaNs make it a failure.
     Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better for it.
     """
     plan = adapt(env).evaluation()
@@ -42,7 +42,7 @@ def fly(
 
     def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
         state, total = carry
-        action = jnp.clip(mean(state.info.get("sensor_obs", state.obs)), -1.0, 1.0)
+        action = jnp.clip(mean(state.obs), -1.0, 1.0)
         after = jax.vmap(env.step)(state, action)
         over = state.done.astype(bool)
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
@@ -59,7 +59,7 @@ def fly(
 
 
 def _observed(state: State) -> chex.Array:
-    return jnp.where(state.done.astype(bool)[:, None], jnp.nan, state.obs)
+    return jnp.where(state.done.astype(bool)[:, None], jnp.nan, state.info.get("true_obs", state.obs))
 
 
 def summarize(flights: Flights) -> dict[str, float]:

@@ -32,6 +32,7 @@ class LearnerSpec(NamedTuple):
     observation_size: int
     action_size: int
     axis: str | None = None  # mesh axis over which a minibatch is sharded; None: one device
+    policy_observation_size: int | None = None  # the policy sees this many, the first; None: all
 
     @property
     def policy(self) -> MLP:
@@ -68,7 +69,8 @@ class UpdateMetrics(NamedTuple):
 def init(spec: LearnerSpec, hyper: Hyperparameters, key: chex.PRNGKey) -> LearnerState:
     policy_key, critic_key = jax.random.split(key)
     observation = jnp.zeros(spec.observation_size)
-    params = Networks(spec.policy.init(policy_key, observation), spec.critic.init(critic_key, observation))
+    seen = _seen(spec, observation)
+    params = Networks(spec.policy.init(policy_key, seen), spec.critic.init(critic_key, observation))
     return LearnerState(
         params=params,
         optimizer=Networks(*(_optimizer(hyper).init(ravel_pytree(network)[0]) for network in params)),
@@ -92,16 +94,24 @@ def sigma(hyper: Hyperparameters, state: LearnerState) -> chex.Array:
 
 
 def preprocess(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, observation: chex.Array) -> chex.Array:
-    """The networks' input of observations; [..., F] -> [..., F]."""
+    """The networks' input of observations, or of the first of their numbers; [..., F] -> [..., F]."""
+    size = observation.shape[-1]
     if spec.config.normalize_observations:
-        standard = (observation - state.statistics.mean) / running_statistics.std(state.statistics)
+        deviation = running_statistics.std(state.statistics)[:size]
+        standard = (observation - state.statistics.mean[:size]) / deviation
         observation = jnp.clip(standard, -MAX_NORMALIZED, MAX_NORMALIZED)
-    return observation if hyper.observation_scale is None else observation * hyper.observation_scale
+    return observation if hyper.observation_scale is None else observation * hyper.observation_scale[:size]
+
+
+def _seen(spec: LearnerSpec, observation: chex.Array) -> chex.Array:
+    """What the policy sees of observations [..., F]."""
+    return observation[..., : spec.policy_observation_size]
 
 
 def policy_mean(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, observation: chex.Array) -> chex.Array:
-    """Mean action of the policy; [..., F] -> [..., A]."""
-    return networks.apply(spec.policy, state.params.policy, preprocess(spec, hyper, state, observation))
+    """Mean action of the policy, of observations or of what it sees of them; [..., F] -> [..., A]."""
+    seen = preprocess(spec, hyper, state, _seen(spec, observation))
+    return networks.apply(spec.policy, state.params.policy, seen)
 
 
 def deployed(spec: LearnerSpec, state: LearnerState) -> LearnerState:
@@ -193,7 +203,7 @@ def targets_of(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, b
     value = networks.apply(spec.critic, state.params.critic, observation).reshape(samples)
     log_rho = jnp.zeros(samples)
     if spec.config.advantage == "pi":
-        mean = networks.apply(spec.policy, state.params.policy, observation)
+        mean = networks.apply(spec.policy, state.params.policy, _seen(spec, observation))
         log_rho = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples) - batch.log_mu
     return jax.lax.stop_gradient(_targets(spec, hyper, state, state.params.critic, value, log_rho, batch))
 
@@ -210,7 +220,7 @@ def _loss(
     samples = batch.reward.shape
     observation = preprocess(spec, hyper, state, _flat(batch.observation))
     value = networks.apply(spec.critic, params.critic, observation).reshape(samples)
-    mean = networks.apply(spec.policy, params.policy, observation)
+    mean = networks.apply(spec.policy, params.policy, _seen(spec, observation))
     log_pi = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples)
     log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
 

@@ -73,6 +73,8 @@ class TaskEnv(Env, Protocol):
     @property
     def params(self) -> Any: ...  # pytree of arrays that sweeps may vary; () for none
     @property
+    def policy_observation_size(self) -> int | None: ...  # a policy sees this many numbers, the first; None: all
+    @property
     def episode_steps(self) -> int: ...  # maximum length of an episode
     @property
     def control_period_s(self) -> float | None: ...  # None: unknown

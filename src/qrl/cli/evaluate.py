@@ -18,7 +18,7 @@ from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import checkpoint, files, record
 from qrl.runs.record import RunConfig
 from qrl_envs import measures
-from qrl_envs.perturbations import Condition, OffNominal, conditions
+from qrl_envs.off_nominal import Condition, OffNominal, conditions
 from qrl_envs.plots import errors, settle
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task

@@ -72,6 +72,11 @@ def build_parser() -> _Parser:
     train.add_argument(
         "--vehicle", metavar="VEHICLE", help="a shipped vehicle's name or a .json file (default: the task's own)"
     )
+    train.add_argument(
+        "--uncertainty",
+        metavar="UNCERTAINTY",
+        help="what differs from flight to flight: a shipped name or a .json file (default: the task's own)",
+    )
     train.add_argument("--seed", type=whole_number, metavar="N", help="first seed (default 0)")
     train.add_argument("--seeds", type=count, metavar="N", help="number of seeds, trained in one program (default 1)")
     train.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default runs/TASK)")
@@ -263,11 +268,13 @@ def _list_tasks(_: argparse.Namespace) -> int:
     from qrl import tasks
     from qrl.cli.terminal import console
     from qrl_envs import task as task_spec
+    from qrl_envs.uncertainty import shipped_uncertainties
     from qrl_envs.vehicle import shipped_vehicles
 
     for name in task_spec.shipped():
         console.print(f"{name:<10} {task_spec.load(name).description}")
     console.print(f"\nBrax's own: {', '.join(tasks.foreign_tasks())}")
     console.print(f"Vehicles (VEHICLE=): {', '.join(shipped_vehicles())}, or a .json file of yours")
+    console.print(f"Uncertainties (UNCERTAINTY=): {', '.join(shipped_uncertainties())}, or a .json file of yours")
     console.print("Your environment: module:factory, a function that returns an environment with Brax's reset and step")
     return DONE

@@ -60,7 +60,8 @@ def train(args: argparse.Namespace) -> int:
         with stop_requested() as stopped:
             finished = run(plan, stopped)
     if finished is None:
-        subject = f"TASK={shlex.quote(args.task)}" if args.task else f"CONFIG={shlex.quote(str(args.config))}"
+        asked = {"TASK": args.task, "CONFIG": args.config, "VEHICLE": args.vehicle, "UNCERTAINTY": args.uncertainty}
+        subject = " ".join(f"{name}={shlex.quote(str(value))}" for name, value in asked.items() if value)
         console.print(f"stopped and saved; to resume: make train {subject} OUT={shlex.quote(str(plan.out))} RESUME=1")
         return FAILED
     if multihost.is_coordinator():
@@ -72,7 +73,8 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     """What to train, and where; None: it is complete. The folder is locked until `stack` closes."""
     flags = _flags(args)
     file = request.config_file(args.config)
-    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds, args.vehicle, args.preset)
+    parts = {"vehicle": args.vehicle, "uncertainty": args.uncertainty}
+    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds, parts, args.preset)
     out: Path = args.out or Path("runs") / tasks.folder_name(config.task)
     if out.exists() and not out.is_dir():
         raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")

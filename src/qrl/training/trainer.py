@@ -38,7 +38,13 @@ class Setup(NamedTuple):
     @property
     def spec(self) -> LearnerSpec:
         axis = SHARD if self.mesh else None
-        return LearnerSpec(self.config, int(self.env.observation_size), self.env.action_size, axis)
+        return LearnerSpec(
+            self.config,
+            int(self.env.observation_size),
+            self.env.action_size,
+            axis,
+            self.env.policy_observation_size,
+        )
 
     @property
     def max_episode_steps(self) -> int:
@@ -196,7 +202,9 @@ def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainS
     def returns_of(now: LearnerState) -> tuple[chex.Array, chex.Array]:
         noise = learner.sigma(inputs.hyper, now) * analytic_gradient.decay(step, updates)
         mean = lambda observation: learner.policy_mean(spec, inputs.hyper, now, observation)  # noqa: E731
-        return analytic_gradient.returns(env, mean, noise, keys, config.apg_episode_length)
+        return analytic_gradient.returns(
+            env, mean, noise, keys, config.apg_episode_length, inputs.hyper.apg_cotangent_norm
+        )
 
     now, metrics, (rewards, complete), skipped = analytic_gradient.update(
         spec, inputs.hyper, state.learner, returns_of, step, updates

@@ -1,0 +1,104 @@
+"""Evaluation under conditions that a task does not name: rotors that lag, latency, other mass, wind, noise, start.
+
+Each is an `Uncertainty` whose ranges are points, flown on the plant of real vehicles; success and errors are measured
+on the true state, as in the task. The magnitudes are this project's; the paper's trial starts as in its figure of a
+hovering trial.
+"""
+
+from typing import Any, NamedTuple
+
+import chex
+import jax.numpy as jnp
+
+from qrl_envs import plant
+from qrl_envs.env import RealQuadrotorEnv
+from qrl_envs.task import QuadrotorTask
+from qrl_envs.uncertainty import Uncertainty
+
+TRIAL_POSITION_M = (-1.58, 0.99, 1.45)  # world
+TRIAL_VELOCITY_M_S = (-2.39, 6.20, 0.77)  # world
+NOISE = {
+    "position_noise_m": 0.01,
+    "velocity_noise_m_s": 0.02,
+    "attitude_noise_rad": 0.01,
+    "body_rate_noise_rad_s": 0.02,
+}
+LAGS_S = (0.02, 0.05, 0.072, 0.1, 0.15)
+LATENCY_S = 0.01
+MOST_LATENCY_S = 0.02
+
+
+class Condition(NamedTuple):
+    """How a flight differs from the nominal vehicle's; by default not at all."""
+
+    description: str  # one line
+    uncertainty: Uncertainty = Uncertainty()
+    paper_trial: bool = False  # start with the position and velocity of the paper's trial
+
+
+def _fixed(**values: float) -> Uncertainty:
+    return Uncertainty(**{name: (value, value) for name, value in values.items()})
+
+
+def conditions(task: QuadrotorTask) -> dict[str, Condition]:
+    """The off-nominal conditions of a task by name; "trial" applies to hover only, wind to a vehicle with drag."""
+    named = {"exact": Condition("the vehicle as in its file, sensors exact", Uncertainty())}
+    for lag_s in LAGS_S:
+        text = f"rotors follow with a time constant of {1e3 * lag_s:g} ms"
+        named[f"lag_{1e3 * lag_s:g}ms"] = Condition(text, _fixed(rotor_lag_s=lag_s))
+    if not task.vehicle.ideal:
+        named["lag_x2"] = Condition("rotors twice as late", _fixed(rotor_lag_factor=2.0))
+    named |= {
+        "latency": Condition("actions 10 ms late", _fixed(latency_s=LATENCY_S)),
+        "latency_20ms": Condition("actions 20 ms late", _fixed(latency_s=2 * LATENCY_S)),
+        "mass_x1.3": Condition("mass 30 % above the file's", _fixed(mass_factor=1.3)),
+        "mass_x0.8": Condition("mass 20 % below", _fixed(mass_factor=0.8)),
+        "thrust_x0.85": Condition("thrust 15 % below, as of a battery nearly empty", _fixed(thrust_factor=0.85)),
+        "inertia_x1.25": Condition("inertia 25 % above", _fixed(inertia_factor=1.25)),
+        "force": Condition("a constant force of a tenth of the weight, in any direction", _fixed(force_weights=0.1)),
+    }
+    wind = {"wind_m_s": 2.0} if any(task.vehicle.drag_N_s_m) else {"force_weights": 0.05}
+    blows = "2 m/s of wind" if "wind_m_s" in wind else "a force of 5 % of the weight"
+    if "wind_m_s" in wind:
+        named["wind"] = Condition("2 m/s of wind", _fixed(**wind))
+    named |= {
+        "noise": Condition("sensors err by 1 cm, 2 cm/s, 0.01 rad, 0.02 rad/s (1 σ, each axis)", _fixed(**NOISE)),
+        "together": Condition(
+            f"latency of 10 ms, noise, mass 20 % above, {blows}",
+            _fixed(**NOISE, **wind, latency_s=LATENCY_S, mass_factor=1.2),
+        ),
+    }
+    if task.evaluation.reward.form == "hover":
+        named["trial"] = Condition("the paper's trial: its position and velocity, any attitude", paper_trial=True)
+    return named
+
+
+class OffNominalParams(NamedTuple):
+    """`env.RealParams` and the start, so that one compiled program serves all conditions."""
+
+    physics: Any
+    reward: Any
+    start: Any
+    bounds: Any
+    ranges: plant.Ranges
+    paper_trial: chex.Array  # [] bool
+
+
+class OffNominal(RealQuadrotorEnv):
+    """A quadrotor task under a condition. A key gives the nominal start, except for what the condition sets.
+
+    The condition is part of the parameters: `with_params` of another OffNominal's parameters takes its condition too.
+    """
+
+    def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
+        super().__init__(task, condition.uncertainty, MOST_LATENCY_S)
+        self.params: Any = OffNominalParams(*self.params, jnp.bool_(condition.paper_trial))
+
+    def _start(self, params: Any, key: chex.PRNGKey) -> plant.Body:
+        body = super()._start(params, key)
+        trial = jnp.array(TRIAL_POSITION_M), jnp.array(TRIAL_VELOCITY_M_S)
+        position, velocity = (
+            jnp.where(params.paper_trial, *pair)
+            for pair in zip(trial, (body.pose.position_m, body.twist.velocity_m_s), strict=True)
+        )
+        return plant.Body(body.pose._replace(position_m=position), body.twist._replace(velocity_m_s=velocity))

@@ -1,0 +1,300 @@
+"""The plant of real vehicles: rotors that lag, commands that act late, drag and disturbances, sensors that err.
+
+A `World` is one flight's draw of an `Uncertainty`; it is constant during the flight. `Flight` is the state. For one
+flight; the caller vmaps.
+"""
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from qrl_envs import integrate, quadrotor, rotation, rotors
+from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
+from qrl_envs.rotors import Rotors
+from qrl_envs.task import Integral
+from qrl_envs.uncertainty import Uncertainty
+from qrl_envs.vehicle import Vehicle
+
+LEAST_THRUST = 1.3  # of weight and force together, unless the vehicle has less: below, a draw is made lighter
+MOST_BODY_RATE_RAD_S = 40.0  # where it saturates
+INTEGRATION_STEP_S = 0.01  # at most; halving it changes nothing that is reported (docs/real_vehicles.md)
+NOISE_ROWS = 4096
+
+
+class Ranges(NamedTuple):
+    """An `Uncertainty` as arrays [2], and the vehicle it is about; so that one program serves all of them."""
+
+    mass_factor: chex.Array
+    inertia_factor: chex.Array
+    thrust_factor: chex.Array
+    motor_factor: chex.Array
+    rotor_rise_s: chex.Array
+    rotor_fall_s: chex.Array
+    drag_factor: chex.Array
+    force_weights: chex.Array
+    torque_share: chex.Array
+    wind_m_s: chex.Array
+    latency_s: chex.Array
+    position_noise_m: chex.Array
+    velocity_noise_m_s: chex.Array
+    attitude_noise_rad: chex.Array
+    body_rate_noise_rad_s: chex.Array
+    position_bias_m: chex.Array
+    thrust_curve: chex.Array  # []
+    drag_N_s_m: chex.Array  # [3]
+
+
+class Noise(NamedTuple):
+    """Standard deviations of Gaussian sensor errors, independent for each axis and step; scalars."""
+
+    position_m: chex.Array
+    velocity_m_s: chex.Array
+    attitude_rad: chex.Array
+    body_rate_rad_s: chex.Array
+
+
+class World(NamedTuple):
+    """One flight's draw."""
+
+    physics: Physics  # the vehicle as it is
+    motor_factor: chex.Array  # [N] thrust, of that of the vehicle file
+    rotors: Rotors
+    disturbance: Disturbance
+    latency_s: chex.Array  # []
+    noise: Noise
+    position_bias_m: chex.Array  # [3] world
+    noise_row: chex.Array  # [] in [0, 1): where this flight begins in the table of noise
+    noise_stride: chex.Array  # [] in [0, 1)
+
+
+DRAWS = 23  # uniform numbers of a draw, besides one for each motor
+
+
+def ranges(uncertainty: Uncertainty, vehicle: Vehicle) -> Ranges:
+    """The ranges of an uncertainty about a vehicle."""
+
+    def lag(own_s: float) -> tuple[float, float]:
+        if uncertainty.rotor_lag_s is not None:
+            return uncertainty.rotor_lag_s
+        low, high = uncertainty.rotor_lag_factor
+        return low * own_s, high * own_s
+
+    data: dict[str, Any] = uncertainty.model_dump(exclude={"rotor_lag_factor", "rotor_lag_s"})
+    data |= {"rotor_rise_s": lag(vehicle.rotor_rise_s), "rotor_fall_s": lag(vehicle.rotor_fall_s)}
+    data |= {"thrust_curve": vehicle.thrust_curve, "drag_N_s_m": vehicle.drag_N_s_m}
+    return Ranges(**{name: jnp.asarray(data[name], jnp.float32) for name in Ranges._fields})
+
+
+def _direction(u: chex.Array) -> chex.Array:
+    """A unit vector [3], uniform over the sphere, from u [2] uniform in [0, 1)."""
+    z = 2.0 * u[0] - 1.0
+    across, angle = jnp.sqrt(1.0 - z * z), 2.0 * jnp.pi * u[1]
+    return jnp.stack([across * jnp.cos(angle), across * jnp.sin(angle), z])
+
+
+def draw(ranges: Ranges, physics: Physics, u: chex.Array) -> World:
+    """The world of a flight, from u [DRAWS + N] uniform in [0, 1).
+
+    A vehicle whose thrust is then under LEAST_THRUST of its weight and the force on it, and under what the vehicle of
+    the file has, is made lighter, and the force weaker.
+    """
+
+    def within(pair: chex.Array, u: chex.Array) -> chex.Array:
+        return pair[0] + (pair[1] - pair[0]) * u
+
+    motors = within(ranges.thrust_factor, u[0]) * within(ranges.motor_factor, u[DRAWS:])
+    own_thrust = jnp.sum(physics.motor_max_N)
+    own_weight_N = physics.mass_kg * physics.gravity_m_s2
+    mass, force = within(ranges.mass_factor, u[1]), within(ranges.force_weights, u[2])
+    thrust = jnp.sum(motors * physics.motor_max_N) / own_weight_N
+    share = jnp.minimum(1.0, thrust / (mass + force) / jnp.minimum(LEAST_THRUST, own_thrust / own_weight_N))
+    mass, force = mass * share, force * share
+    roll = jnp.min(jnp.sum(jnp.abs(physics.motor_torque_m[:2]), axis=1)) / 2.0 * jnp.mean(physics.hover_thrust_N)
+    wind = 2.0 * jnp.pi * u[3]
+    return World(
+        physics=physics._replace(
+            mass_kg=physics.mass_kg * mass, inertia_kg_m2=physics.inertia_kg_m2 * within(ranges.inertia_factor, u[4])
+        ),
+        motor_factor=motors,
+        rotors=Rotors(within(ranges.rotor_rise_s, u[5]), within(ranges.rotor_fall_s, u[5]), ranges.thrust_curve),
+        disturbance=Disturbance(
+            drag_N_s_m=ranges.drag_N_s_m * within(ranges.drag_factor, u[6]),
+            wind_m_s=within(ranges.wind_m_s, u[7]) * jnp.stack([jnp.cos(wind), jnp.sin(wind), jnp.zeros_like(wind)]),
+            force_N=force * own_weight_N * _direction(u[8:10]),
+            torque_N_m=within(ranges.torque_share, u[10]) * roll * _direction(u[11:13]),
+        ),
+        latency_s=within(ranges.latency_s, u[13]),
+        noise=Noise(*(within(getattr(ranges, name), u[14 + i]) for i, name in enumerate(NOISES))),
+        position_bias_m=within(ranges.position_bias_m, u[18]) * _direction(u[19:21]),
+        noise_row=u[21],
+        noise_stride=u[22],
+    )
+
+
+NOISES = ("position_noise_m", "velocity_noise_m_s", "attitude_noise_rad", "body_rate_noise_rad_s")
+
+
+
+class Flight(NamedTuple):
+    """State of a flight; N motors."""
+
+    body: Body
+    speed: chex.Array  # [N] of the rotors, of their greatest
+    set_points: chex.Array  # [D, N] speeds commanded, the latest first: those that may not have acted yet
+    world: World
+    sensed: Body  # the body as measured
+    previous_action: chex.Array  # [N] applied
+    integral_m_s: chex.Array  # [3] of the position error, gated (`task.Integral`)
+    steps: chex.Array  # int32 []
+
+
+def delayed_steps(latency_s: float, dt_s: float) -> int:
+    """D: how many set-points can matter at a latency."""
+    return int(np.ceil(latency_s / dt_s - 1e-6)) + 1
+
+
+def begin(body: Body, world: World, steps_late: int, integral: Integral | None, dt_s: float) -> Flight:
+    """A flight's state at its start: rotors at the speed of hover, a previous action of 0."""
+    physics = world.physics
+    hover = rotors.speed_of(world.rotors.curve, physics.hover_thrust_N / physics.motor_max_N)
+    motors = hover.shape[0]
+    sensed = sense(world, body, jnp.int32(0))
+    return Flight(
+        body=body,
+        speed=hover,
+        set_points=jnp.broadcast_to(hover, (steps_late, motors)),
+        world=world,
+        sensed=sensed,
+        previous_action=jnp.zeros(motors),
+        integral_m_s=integrated(jnp.zeros(3), sensed.pose.position_m, integral, dt_s),
+        steps=jnp.int32(0),
+    )
+
+
+def step(flight: Flight, action: chex.Array, integral: Integral | None, dt_s: float) -> Flight:
+    """One control period under `action` [N]."""
+    world, physics = flight.world, flight.world.physics
+    thrust = quadrotor.thrust_N(physics, action)
+    set_point = rotors.speed_of(world.rotors.curve, thrust / physics.motor_max_N)
+    set_points = jnp.concatenate([set_point[None], flight.set_points[:-1]])
+    # Set-point i acts from latency_s − i·dt_s on; before that, set-point i + 1.
+    first = jnp.floor(world.latency_s / dt_s + 1e-4)
+    late_s = jnp.maximum(world.latency_s - first * dt_s, 0.0)
+    ages = jnp.arange(set_points.shape[0])[:, None]
+    new = jnp.sum(jnp.where(ages == first, set_points, 0.0), axis=0)
+    old = jnp.sum(jnp.where(ages == jnp.minimum(first + 1, set_points.shape[0] - 1), set_points, 0.0), axis=0)
+
+    def speed_at(time_s: chex.Array) -> chex.Array:
+        before = rotors.after(world.rotors, flight.speed, old, jnp.minimum(time_s, late_s))
+        return rotors.after(world.rotors, before, new, jnp.maximum(time_s - late_s, 0.0))
+
+    def thrust_at(time_s: chex.Array) -> chex.Array:
+        fraction = rotors.thrust_fraction(world.rotors.curve, speed_at(time_s))
+        return world.motor_factor * physics.motor_max_N * fraction
+
+    substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
+    body, short_s = flight.body, dt_s / substeps
+    for i in range(substeps):
+        begin_s, middle_s = jnp.float32(i * short_s), jnp.float32((i + 0.5) * short_s)
+        body = integrate.midpoint(
+            lambda b, t=begin_s: quadrotor.derivative(physics, b, thrust_at(t), world.disturbance),
+            lambda b, t=middle_s: quadrotor.derivative(physics, b, thrust_at(t), world.disturbance),
+            body,
+            short_s,
+        )
+        body = _renormalized(body)
+    steps = flight.steps + 1
+    sensed = sense(world, body, steps)
+    return Flight(
+        body=body,
+        speed=speed_at(jnp.float32(dt_s)),
+        set_points=set_points,
+        world=world,
+        sensed=sensed,
+        previous_action=quadrotor.applied_action(physics, thrust),
+        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m, integral, dt_s),
+        steps=steps,
+    )
+
+
+def _renormalized(body: Body) -> Body:
+    """`body` with a unit quaternion, and body rates saturated at MOST_BODY_RATE_RAD_S."""
+    rate = body.twist.body_rate_rad_s
+    square = jnp.sum(rate * rate)
+    over = square > MOST_BODY_RATE_RAD_S**2
+    rate = rate * jnp.where(over, MOST_BODY_RATE_RAD_S * jax.lax.rsqrt(jnp.where(over, square, 1.0)), 1.0)
+    return Body(
+        body.pose._replace(attitude=rotation.normalize(body.pose.attitude)), body.twist._replace(body_rate_rad_s=rate)
+    )
+
+
+def integrated(total: chex.Array, position_m: chex.Array, integral: Integral | None, dt_s: float) -> chex.Array:
+    """The integral [3] after a period at `position_m` [3] (`task.Integral`)."""
+    if integral is None:
+        return total
+    near = jnp.maximum(0.0, 1.0 - jnp.sum(position_m**2) / integral.radius_m**2)
+    return jnp.clip(total + dt_s * position_m * near**2, -integral.limit_m_s, integral.limit_m_s)
+
+
+def _noise_table() -> np.ndarray:
+    """Standard normal numbers [NOISE_ROWS, 12]. Drawn anew at each step they would take longer than the physics."""
+    return np.random.default_rng(2026).standard_normal((NOISE_ROWS, 12)).astype(np.float32)
+
+
+NOISE_TABLE = _noise_table()
+
+
+def sense(world: World, body: Body, steps: chex.Array) -> Body:
+    """`body` as measured at a flight's step: with bias and noise, of which each flight has its own sequence."""
+    # A prime stride and a random start, so that flights do not share pairs of rows at the same distance.
+    start = (world.noise_row * NOISE_ROWS).astype(jnp.int32)
+    stride = 2 * (world.noise_stride * 1000).astype(jnp.int32) + 1
+    row = jnp.asarray(NOISE_TABLE)[(start + steps * stride) % NOISE_ROWS].reshape(4, 3)
+    noise = world.noise
+    # A small-angle quaternion, normalized: a rotation exactly, its angle to 1e-5 of itself.
+    small = rotation.normalize(jnp.concatenate([jnp.ones(1), noise.attitude_rad / 2 * row[2]]))
+    (p, q), (v, w) = body
+    return Body(
+        Pose(p + world.position_bias_m + noise.position_m * row[0], rotation.product(q, small)),
+        Twist(v + noise.velocity_m_s * row[1], w + noise.body_rate_rad_s * row[3]),
+    )
+
+
+def observe(flight: Flight, previous_action: bool, integral: Integral | None) -> chex.Array:
+    """What a policy observes: the measured body [18], then its memory: previous action [N], integral [3]."""
+    parts = [quadrotor.observe(flight.sensed)]
+    if previous_action:
+        parts.append(flight.previous_action)
+    if integral is not None:
+        parts.append(flight.integral_m_s)
+    return jnp.concatenate(parts)
+
+
+PRIVILEGED = 14  # numbers of `privileged`, besides one for each motor
+
+
+def privileged(flight: Flight, nominal: Physics, dt_s: float) -> chex.Array:
+    """What only a critic may see, about 1 in size: three numbers of force and of torque, six of the vehicle, latency,
+    drag; rotor speeds [N].
+    """
+    world = flight.world
+    weight_N = nominal.mass_kg * nominal.gravity_m_s2
+    drag = jnp.mean(world.disturbance.drag_N_s_m)
+    push = world.disturbance.force_N + drag * world.disturbance.wind_m_s
+    roll = jnp.min(jnp.sum(jnp.abs(nominal.motor_torque_m[:2]), axis=1)) * jnp.mean(nominal.hover_thrust_N)
+    factors = jnp.stack(
+        [
+            4.0 * (world.physics.mass_kg / nominal.mass_kg - 1.0),
+            4.0 * (jnp.mean(world.motor_factor) - 1.0),
+            4.0 * (jnp.mean(world.physics.inertia_kg_m2) / jnp.mean(nominal.inertia_kg_m2) - 1.0),
+            10.0 * world.rotors.rise_s,
+            10.0 * world.rotors.fall_s,
+            world.latency_s / dt_s,
+            drag / nominal.mass_kg,
+            world.noise.position_m * 100.0,
+        ]
+    )
+    return jnp.concatenate([5.0 * push / weight_N, 20.0 * world.disturbance.torque_N_m / roll, factors, flight.speed])
