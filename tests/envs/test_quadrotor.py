@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from qrl_envs import quadrotor, rotation, task
-from qrl_envs.quadrotor import Body, Physics, Pose, Twist
+from qrl_envs import integrate, quadrotor, rotation, task
+from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
 from qrl_envs.vehicle import Motor, Vehicle
 
 Array = np.ndarray
@@ -32,6 +32,23 @@ CROOKED = Vehicle(
         Motor(position_m=(-0.09, 0.06), spin=-1, max_N=4.0),
         Motor(position_m=(-0.13, -0.08), spin=1, max_N=3.5),
         Motor(position_m=(0.05, -0.12), spin=-1, max_N=3.0),
+    ),
+    yaw_moment_m=0.016,
+    action_scale_N=6.0,
+)
+
+
+# As crooked, and with motors that tilt and stand at different heights, and products of inertia.
+TILTED = Vehicle(
+    mass_kg=0.7,
+    inertia_kg_m2=(0.002, 0.003, 0.004, 0.0002, -0.0003, 0.0001),
+    motors=(
+        Motor(position_m=(0.11, 0.07, 0.01), axis=(0.1, 0.2, 2.0), spin=1, max_N=5.0),
+        Motor(position_m=(-0.09, 0.06, -0.02), axis=(0.1, -0.1, 1.0), spin=-1, max_N=4.0, min_N=0.1),
+        Motor(position_m=(-0.13, -0.08, 0.03), axis=(-0.2, 0.0, 1.0), spin=1, max_N=3.5),
+        Motor(position_m=(0.05, -0.12), axis=(0.0, 0.1, 0.9), spin=-1, max_N=3.0),
+        Motor(position_m=(0.0, 0.15), spin=-1, max_N=3.0),
+        Motor(position_m=(0.02, -0.14), spin=1, max_N=3.0),
     ),
     yaw_moment_m=0.016,
     action_scale_N=6.0,
@@ -72,7 +89,7 @@ def to_world(q: Array) -> Rotation:
     return Rotation.from_quat(q, scalar_first=True)
 
 
-derivatives = jax.jit(jax.vmap(quadrotor.derivative, in_axes=(None, 0, 0)))
+derivatives = jax.jit(jax.vmap(quadrotor.derivative, in_axes=(None, 0, 0, None)))
 step = jax.jit(quadrotor.step)
 products = jax.jit(jax.vmap(rotation.product))
 matrices = jax.jit(jax.vmap(rotation.matrix))
@@ -85,13 +102,17 @@ def fly_euler(physics: Physics, body: Body, thrust: Array, dt_s: float, steps: i
 
 
 @jax.jit
-def fly_rk4(physics: Physics, body: Body, thrust: Array, dt_s: float, steps: int) -> Body:
-    """The same time in as many parts by Runge–Kutta."""
-    return quadrotor.step_rk4(physics, body, thrust, steps * dt_s, steps)
+def fly_midpoint(physics: Physics, body: Body, thrust: Array, dt_s: float, steps: int) -> Body:
+    """As the plant of real vehicles takes them."""
+
+    def rate(body: Body) -> Body:
+        return quadrotor.derivative(physics, body, thrust)
+
+    return jax.lax.fori_loop(0, steps, lambda _, b: integrate.midpoint(rate, rate, b, dt_s), body)
 
 
 Integrator = Callable[[Physics, Body, Array, float, int], Body]
-each_integrator = pytest.mark.parametrize(("fly", "order"), [(fly_euler, 1), (fly_rk4, 4)], ids=["euler", "rk4"])
+each_integrator = pytest.mark.parametrize(("fly", "order"), [(fly_euler, 1), (fly_midpoint, 2)], ids=["euler", "midpoint"])
 
 
 def momentum_and_energy(vehicle: Physics, body: Body) -> Array:
@@ -104,21 +125,29 @@ def momentum_and_energy(vehicle: Physics, body: Body) -> Array:
     return np.append(to_world(q).apply(inertia * rate), energy)
 
 
-def newton_euler(vehicle: Physics, thrust: Array) -> Callable[[float, Array], Array]:
+def newton_euler(
+    vehicle: Vehicle, thrust: Array, drag: Array = np.zeros(3), push: Array = np.zeros(6), wind: Array = np.zeros(3)
+) -> Callable[[float, Array], Array]:
     """The equations of motion, written apart: r × F for each motor, and the attitude as a rotation matrix.
 
-    State [18]: position, velocity, body rates, rotation matrix.
+    State [18]: position, velocity, body rates, rotation matrix. `push`: a force, world, and a torque, body.
     """
-    arms = np.concatenate([vehicle.motor_position_m, np.zeros((4, 1))], axis=1)
-    moments = np.cross(arms, thrust[:, None] * UP)
-    moments[:, 2] += np.asarray(vehicle.motor_spin) * float(vehicle.yaw_moment_m) * thrust
-    inertia = np.diag(vehicle.inertia_kg_m2)
+    force, moment = np.zeros(3), push[3:].copy()
+    for motor, pull in zip(vehicle.motors, thrust, strict=True):
+        axis = np.array(motor.axis) / np.linalg.norm(motor.axis)
+        arm = np.resize([*motor.position_m, 0.0], 3)
+        force += pull * axis
+        moment += np.cross(arm, pull * axis) + motor.spin * vehicle.yaw_moment_m * pull * axis
+    xx, yy, zz, xy, xz, yz = np.resize([*vehicle.inertia_kg_m2, 0.0, 0.0, 0.0], 6)
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    gravity = float(np.float32(GRAVITY))
 
     def rate_of_change(_: float, x: Array) -> Array:
         velocity, w, to_world = x[3:6], x[6:9], x[9:].reshape(3, 3)
         skew = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-        acceleration = to_world @ UP * thrust.sum() / float(vehicle.mass_kg) - float(vehicle.gravity_m_s2) * UP
-        w_dot = np.linalg.solve(inertia, moments.sum(axis=0) - np.cross(w, inertia @ w))
+        air = to_world.T @ (velocity - wind)
+        acceleration = (to_world @ (force - drag * air) + push[:3]) / vehicle.mass_kg - gravity * UP
+        w_dot = np.linalg.solve(inertia, moment - np.cross(w, inertia @ w))
         return np.concatenate([velocity, acceleration, w_dot, (to_world @ skew).ravel()])
 
     return rate_of_change
@@ -141,7 +170,7 @@ def test_order_of_convergence(fly: Integrator, order: int) -> None:
     vehicle, thrust = physics(CROOKED), np.array([1.9, 1.6, 1.8, 1.7])
     start = one(bodies(np.random.default_rng(0), 1))
     exact = solve_ivp(
-        newton_euler(vehicle, thrust), (0.0, 0.4), flat(start), method="DOP853", rtol=1e-12, atol=1e-12
+        newton_euler(CROOKED, thrust), (0.0, 0.4), flat(start), method="DOP853", rtol=1e-12, atol=1e-12
     ).y[:, -1]
     steps = [80, 160, 320, 640]
     errors = [float(np.linalg.norm(flat(fly(vehicle, start, thrust, 0.4 / n, n)) - exact)) for n in steps]
@@ -150,8 +179,8 @@ def test_order_of_convergence(fly: Integrator, order: int) -> None:
 
 @pytest.mark.parametrize(
     ("fly", "order", "steps"),
-    [(fly_euler, 1, [400, 800, 1600]), (fly_rk4, 4, [40, 80, 160])],  # where the order shows above the rounding
-    ids=["euler", "rk4"],
+    [(fly_euler, 1, [400, 800, 1600]), (fly_midpoint, 2, [400, 800, 1600])],
+    ids=["euler", "midpoint"],
 )
 def test_torque_free_motion_keeps_momentum_and_energy(fly: Integrator, order: int, steps: list[int]) -> None:
     """In free fall, world-frame angular momentum and energy: what is lost in 1 s vanishes as the order says."""
@@ -167,16 +196,19 @@ def test_torque_free_motion_keeps_momentum_and_energy(fly: Integrator, order: in
         assert fitted_order(error, steps) > order - 0.15
 
 
-def test_derivative_is_newton_euler() -> None:
-    """In 50 random states under random thrusts, all 18 rates of change."""
+@pytest.mark.parametrize("spec", [CROOKED, TILTED], ids=["crooked", "tilted"])
+def test_derivative_is_newton_euler(spec: Vehicle) -> None:
+    """In 50 random states under random thrusts, drag, wind, force and torque: all 18 rates of change."""
     rng = np.random.default_rng(2)
-    vehicle, body, thrust = physics(CROOKED), bodies(rng, 50), rng.uniform(0.0, 5.0, size=(50, 4))
-    ours = derivatives(vehicle, body, thrust)
+    vehicle, body = physics(spec), bodies(rng, 50)
+    thrust = rng.uniform(0.0, 5.0, size=(50, len(spec.motors)))
+    drag, wind, push = np.array([0.1, 0.2, 0.3]), np.array([1.0, -2.0, 0.5]), 0.1 * np.arange(1.0, 7.0)
+    ours = derivatives(vehicle, body, thrust, Disturbance(drag, wind, push[:3], push[3:]))
     for i in range(50):
-        expected = newton_euler(vehicle, thrust[i])(0.0, flat(one(body, i)))
+        expected = newton_euler(spec, thrust[i], drag, push, wind)(0.0, flat(one(body, i)))
         np.testing.assert_allclose(ours.pose.position_m[i], expected[:3], atol=1e-12)
         np.testing.assert_allclose(ours.twist.velocity_m_s[i], expected[3:6], atol=1e-12)
-        np.testing.assert_allclose(ours.twist.body_rate_rad_s[i], expected[6:9], rtol=1e-12, atol=1e-9)
+        np.testing.assert_allclose(ours.twist.body_rate_rad_s[i], expected[6:9], rtol=3e-7, atol=1e-6)  # parameters are float32
 
 
 @pytest.mark.parametrize("yaw", np.linspace(-np.pi, np.pi, 9))
@@ -187,7 +219,7 @@ def test_hover_thrust_holds_a_level_vehicle_still_at_any_yaw(yaw: float) -> None
     np.testing.assert_allclose(thrust, 0.667 * GRAVITY / 4, rtol=1e-7)
     q = Rotation.from_euler("z", yaw).as_quat(scalar_first=True)
     level = Body(Pose(np.array([1.0, 2.0, 3.0]), q), Twist(np.zeros(3), np.zeros(3)))
-    rates = derivatives(vehicle, jax.tree.map(lambda x: x[None], level), thrust[None])
+    rates = derivatives(vehicle, jax.tree.map(lambda x: x[None], level), thrust[None], None)
     # F_o is rounded to the float32 that the world flies with.
     np.testing.assert_allclose(np.concatenate(jax.tree.leaves(rates), axis=-1), 0.0, atol=1e-6)
     after = step(vehicle, level, thrust, 0.01)
@@ -200,10 +232,10 @@ def test_one_motors_torque_is_r_cross_f_and_its_reaction(motor: int) -> None:
     vehicle, body = physics(CROOKED), bodies(np.random.default_rng(3), 1, rate=0.0)
     force = 2.5
     thrust = np.eye(4)[[motor]] * force
-    x, y = CROOKED.motors[motor].position_m
+    x, y = CROOKED.motors[motor].position_m[:2]
     reaction = CROOKED.motors[motor].spin * 0.016 * force
     torque = np.cross([x, y, 0.0], [0.0, 0.0, force]) + reaction * UP
-    ours = derivatives(vehicle, body, thrust).twist.body_rate_rad_s[0] * np.array(CROOKED.inertia_kg_m2)
+    ours = derivatives(vehicle, body, thrust, None).twist.body_rate_rad_s[0] * np.array(CROOKED.inertia_kg_m2)
     np.testing.assert_allclose(ours, torque, rtol=1e-6)
 
 
@@ -217,7 +249,7 @@ def test_a_stronger_motor_tips_the_vehicle_away_from_it(motor: int, forward: int
     thrust = np.asarray(quadrotor.thrust_N(vehicle, 0.02 * jnp.eye(4)[motor]))
     level = Body(Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), Twist(np.zeros(3), np.zeros(3)))
     after = fly_euler(vehicle, level, thrust, 0.01, 20)
-    x, y = PAPERS.motors[motor].position_m
+    x, y = PAPERS.motors[motor].position_m[:2]
     corner = to_world(np.asarray(after.pose.attitude)).apply([x, y, 0.0])
     assert corner[2] > 0
     assert np.sign(after.pose.position_m[0]) == forward
@@ -232,8 +264,8 @@ def test_free_fall_is_a_parabola_while_the_vehicle_tumbles() -> None:
     p, v, _ = flat(start).reshape(6, 3)[:3]
     g, dt, steps = float(vehicle.gravity_m_s2), 0.01, 100
     t = dt * steps
-    euler, rk4 = (fly(vehicle, start, np.zeros(4), dt, steps) for fly in (fly_euler, fly_rk4))
-    for body, drop in ((euler, t * (t + dt) / 2), (rk4, t**2 / 2)):
+    euler, midpoint = (fly(vehicle, start, np.zeros(4), dt, steps) for fly in (fly_euler, fly_midpoint))
+    for body, drop in ((euler, t * (t + dt) / 2), (midpoint, t**2 / 2)):
         np.testing.assert_allclose(body.pose.position_m, p + v * t - g * drop * UP, atol=1e-12)
         np.testing.assert_allclose(body.twist.velocity_m_s, v - g * t * UP, atol=1e-12)
 
@@ -243,7 +275,7 @@ def test_one_step_moves_the_pose_with_the_new_velocities() -> None:
     vehicle, thrust, dt = physics(CROOKED), np.array([1.9, 1.6, 1.8, 1.7]), 0.01
     before = one(bodies(np.random.default_rng(5), 1))
     after = step(vehicle, before, thrust, dt)
-    rates = newton_euler(vehicle, thrust)(0.0, flat(before))
+    rates = newton_euler(CROOKED, thrust)(0.0, flat(before))
     velocity, body_rate = before.twist.velocity_m_s + dt * rates[3:6], before.twist.body_rate_rad_s + dt * rates[6:9]
     q = before.pose.attitude
     q_dot = 0.5 * np.append(-q[1:] @ body_rate, q[0] * body_rate + np.cross(q[1:], body_rate))
