@@ -53,10 +53,14 @@ def _threads() -> Iterator[None]:
 
 
 def _quickly() -> Iterator[None]:
-    """For what runs for milliseconds: XLA's optimisations would take twice the time of the rest."""
+    """For what runs for milliseconds, here or in a process that a test starts: XLA's optimisations would take twice the
+    time of the rest.
+    """
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
-    yield
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+        yield
     jax.config.update("jax_disable_most_optimizations", before)
 
 

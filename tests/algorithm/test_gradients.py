@@ -15,9 +15,15 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from bound_learner import BoundLearner
+from qrl.algorithm import learner as algorithm
+from qrl.algorithm import replay_buffer
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerState, UpdateMetrics
 from qrl.algorithm.types import Networks, Transition
 from qrl.config import Config, Hyperparameters, load_preset
+from qrl.training import trainer
+from qrl.training.state import MemberInputs
+from qrl.training.trainer import Setup
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
@@ -94,9 +100,14 @@ def batch(where: Array, why: str, seed: int = 0) -> Transition:
     )
 
 
+@functools.cache
+def first_state() -> LearnerState:
+    return learner_of().init(jax.random.PRNGKey(1))
+
+
 def begin(learner: BoundLearner, data: Transition, progress: float, critic: float = 1.0) -> LearnerState:
     """A state that has seen the rewards, and whose networks are lively; the critic's output times `critic`."""
-    state = learner.init(jax.random.PRNGKey(1))
+    state = first_state()._replace(planned_updates=jnp.int32(learner.planned_updates))
     noise = np.random.default_rng(2)
     params = jax.tree.map(lambda x: x + 0.3 * noise.normal(size=x.shape), doubles(state.params))
     *_, last = params.critic["params"]
@@ -154,9 +165,12 @@ def constants(learner: BoundLearner, progress: float, params: Networks, d: Trans
             rho, trace = (min(x, ratio[b, i]) if off_policy else 1.0 for x in (hyper.rho_bar, hyper.c_bar))
             error = rho * delta + trace * hyper.gamma * hyper.lam * error
             target[b, i] = v[b, i] + error
-    if c.normalize_advantage:
-        advantage = advantage / (np.sqrt((advantage**2).mean()) + 1e-8)
     return Constants(advantage, target)
+
+
+def normalized(known: Constants) -> Constants:
+    """A divided by its root mean square."""
+    return known._replace(advantage=known.advantage / (np.sqrt((known.advantage**2).mean()) + 1e-8))
 
 
 def surrogate(
@@ -190,6 +204,7 @@ def assert_literal(learner: BoundLearner, data: Transition, critic: float = 1.0)
     noise = np.random.default_rng(5).normal(size=data.reward.shape)
     data = data._replace(log_mu=np.asarray(log_pi(learner.hyper, progress, state.params.policy, data)) + 0.4 * noise)
     known = constants(learner, progress, state.params, data)
+    known = normalized(known) if learner.config.normalize_advantage else known
     (_, each), slope = surrogate_gradient(learner.config.form, state.params, learner.hyper, progress, data, known)
     after, terms = update_of(learner.config.advantage, learner.config.form, learner.hyper.xi is None)(
         learner.hyper, state, data
@@ -267,3 +282,97 @@ def test_targets_are_within_what_the_rewards_can_pay() -> None:
         error = np.sqrt(terms.value_loss)  # root mean square
         nearest, farthest = sorted((abs(v), abs(v + 100.0)))
         assert nearest - 1e-6 <= error <= farthest + 1e-6
+
+
+PASSES = 3
+PPO = {
+    "sampling": "epochs",
+    "symmetries": False,
+    "num_timesteps": B * T * 10,
+    "num_envs": B,
+    "unroll_length": T,
+    "replay_unrolls": 1,
+    "warmup_unrolls": 1,
+    "batch_size": 2,
+    "updates_per_unroll": PASSES * B // 2,
+    "learning_rate": 0.03,
+    "lam": 0.8,
+    "epsilon": 0.1,
+}
+
+
+def test_ppos_targets_are_gae() -> None:
+    """Whatever the present policy is: of the critic alone, over every place and reason of ends, not normalized."""
+    learner = learner_of("mu", **PPO)
+    targets_of = jax.jit(functools.partial(algorithm.targets_of, learner.spec, learner.hyper))
+    for seed, where in enumerate(WHERE.values()):
+        for why in WHY:
+            data = batch(where, why, seed)
+            state = begin(learner, data, 0.0)
+            found, known = targets_of(state, data), constants(learner, 0.0, state.params, data)
+            np.testing.assert_allclose(found.a_trace, known.advantage, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(found.v_trace, known.target, rtol=1e-9, atol=1e-12)
+
+
+def ppo_losses(params: Networks, hyper: Hyperparameters, progress: float, d: Transition, known: Constants) -> Any:
+    """-(PPO's clipped surrogate, Schulman et al. 2017, eq. 7) + the critic's; and the share of ratios out of bounds."""
+    ratio = jnp.exp(log_pi(hyper, progress, params.policy, d) - d.log_mu)
+    low, high = 1.0 - hyper.epsilon, 1.0 + hyper.epsilon
+    gain = jnp.minimum(ratio * known.advantage, jnp.clip(ratio, low, high) * known.advantage)
+    v = mlp(params.critic, d.observation * hyper.observation_scale)[..., 0]
+    return jnp.mean((v - known.target) ** 2) - jnp.mean(gain), jnp.mean((ratio < low) | (ratio > high))
+
+
+@jax.jit
+def ppo_slope(params: Networks, *given: Any) -> tuple[tuple[jax.Array, jax.Array], Networks]:
+    return jax.value_and_grad(ppo_losses, has_aux=True)(params, *given)
+
+
+class Sized:
+    """An environment of which nothing is asked but its sizes."""
+
+    observation_size, action_size = F, A
+
+
+def test_ppos_passes_are_a_literal_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three passes, minibatch after minibatch: GAE of the networks before the first of them, A divided by its root mean
+    square over the minibatch, the clipped surrogate's gradient, and Adam, in NumPy.
+
+    The objective is the clip less A, so that both have the same gradient.
+    """
+    learner = learner_of("mu", **PPO)
+    data, planned = batch(WHERE["many"], "all"), learner.planned_updates
+    state = begin(learner, data, 0.25)
+    data = data._replace(log_mu=np.asarray(log_pi(learner.hyper, 0.25, state.params.policy, data)))
+    order = np.random.default_rng(8).permuted(np.tile(np.arange(B), (PASSES, 1)), axis=1).reshape(-1, 2)
+    monkeypatch.setattr(replay_buffer, "epochs", lambda *_: jnp.asarray(order))
+    buffer = replay_buffer.add(replay_buffer.create(data, 1), data)
+    setup, inputs = Setup(adapt(Sized()), learner.config), MemberInputs(learner.hyper, ())
+    updates = jax.jit(lambda state, key: trainer._updates(setup, inputs, state, buffer, key))
+    after, metrics = updates(state, jax.random.PRNGKey(0))
+
+    fixed = constants(learner, 0.25, state.params, data)
+    params, outside = state.params, []
+    first, second = (jax.tree.map(np.zeros_like, params) for _ in range(2))
+    for i, index in enumerate(order):
+        progress = (int(state.updates) + i) / planned
+        part, known = (jax.tree.map(lambda x, index=index: x[index], x) for x in (data, fixed))
+        known = normalized(known)
+        (loss, share), slope = ppo_slope(params, learner.hyper, progress, part, known)
+        slope, terms = jax.tree.map(np.asarray, slope), UpdateMetrics(*np.asarray(metrics[i]))
+        found = terms.policy_loss + terms.value_loss
+        np.testing.assert_allclose(found, loss + known.advantage.mean(), rtol=1e-6)
+        first, second = (
+            jax.tree.map(lambda m, g, k=k, b=b: b * m + (1 - b) * g**k, moment, slope)
+            for moment, k, b in ((first, 1, 0.9), (second, 2, 0.999))
+        )
+        rate = learner.config.learning_rate * (1 - progress) + learner.config.learning_rate_end * progress
+        unbiased = 1 - 0.9 ** (i + 1), 1 - 0.999 ** (i + 1)
+        params = jax.tree.map(
+            lambda p, m, v, rate=rate, u=unbiased: p - rate * (m / u[0]) / (np.sqrt(v / u[1]) + 1e-8),
+            *(params, first, second),
+        )
+        outside.append(float(share))
+    assert outside[0] == 0.0
+    assert 0.1 < outside[-1] < 0.9
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-8), after.params, params)

@@ -16,12 +16,15 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # flashbax's own imports
     import flashbax
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 Array = np.ndarray
 
 SLOTS, LANES, STEPS, BATCH = 4, 3, 5, 512
 ADDS = range(2 * SLOTS + 2)  # from an empty ring to the second time around
 
 add = jax.jit(replay_buffer.add)
+indices = jax.jit(replay_buffer.sample, static_argnums=(2, 3))
 
 
 @jax.jit
@@ -160,7 +163,7 @@ def test_shards_draw_their_part_of_each_minibatch_from_their_own_lanes(adds: int
 
     def drawn(lanes: Array, keys: jax.Array) -> Array:
         ring = ring_of(lanes)
-        index = replay_buffer.sample(ring, keys, minibatches, each)
+        index = indices(ring, keys, minibatches, each)
         assert index.shape == (minibatches, len(keys) * each)
         return np.asarray(replay_buffer.gather(ring, index)["x"])[..., 0]
 
@@ -172,6 +175,47 @@ def test_shards_draw_their_part_of_each_minibatch_from_their_own_lanes(adds: int
         held = [100 * i + lane for i in range(max(0, adds - SLOTS), adds) for lane in lanes]
         np.testing.assert_array_equal(np.unique(whole[:, shard]), held)
     assert (whole[:, 0] % width != whole[:, 1] % width).any()  # they do not draw alike
+
+
+@pytest.fixture(scope="module")
+def orders() -> Array:
+    """Indices of four passes over the newest slot, which has two shards of four lanes, from 300 pairs of keys:
+    [300, pass, shard, lane]."""
+    shards, width, each, passes = 2, 4, 2, 4
+    ring = replay_buffer.create({"x": np.zeros((shards * width, 1), np.float32)}, SLOTS)._replace(
+        inserted=jnp.int32(SLOTS + 3)
+    )
+    minibatches = passes * width // each
+    keys = jax.random.split(jax.random.PRNGKey(0), (300, shards))
+    draw = jax.jit(jax.vmap(lambda keys: replay_buffer.epochs(ring, keys, minibatches, each)))
+    drawn = np.asarray(draw(keys))
+    assert drawn.shape == (300, minibatches, shards * each)
+    of_shards = drawn.reshape(300, passes, width // each, shards, each).swapaxes(2, 3)
+    first = 2 * shards * width + width * np.arange(shards)  # the third slot is the newest
+    return of_shards.reshape(300, passes, shards, width) - first[:, None]
+
+
+def test_each_pass_has_every_trajectory_of_the_newest_slot_once(orders: Array) -> None:
+    """Each shard's of its own lanes; all minibatches of a pass together."""
+    np.testing.assert_array_equal(np.sort(orders, axis=-1), np.broadcast_to(np.arange(4), orders.shape))
+
+
+@pytest.mark.parametrize("other", ["pass", "shard", "update"])
+def test_each_pass_has_an_order_of_its_own(orders: Array, other: str) -> None:
+    """All 24 orders are as likely, and one says nothing of the next pass's, of the other shard's, of the next keys'.
+
+    Of that the chi-square test of the lanes that come first in both.
+    """
+    names = orders @ 4 ** np.arange(4)
+    assert stats.chisquare(np.unique(names, return_counts=True)[1]).pvalue > 0.001
+    assert len(np.unique(names)) == 24
+    pairs = {
+        "pass": (orders[:, :-1], orders[:, 1:]),
+        "shard": (orders[:, :, 0], orders[:, :, 1]),
+        "update": (orders[:-1], orders[1:]),
+    }
+    one, two = (x[..., 0].ravel() for x in pairs[other])
+    assert stats.chisquare(np.bincount(4 * one + two, minlength=16)).pvalue > 0.001
 
 
 def test_the_key_decides_the_sample(ring_after: list[ReplayBuffer]) -> None:

@@ -10,7 +10,11 @@ from hypothesis import strategies as st
 
 from qrl.algorithm.running_statistics import MIN_STD, init, std, update
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 F = 3
+
+update_ours, update_theirs = jax.jit(update), jax.jit(brax_statistics.update)
 
 
 def batches(sizes: list[int], offset: float = 3.0) -> list[np.ndarray]:
@@ -24,10 +28,7 @@ def test_batch_by_batch_is_all_at_once(sizes: list[int]) -> None:
     parts = batches(sizes)
     ours, theirs = init(F), brax_statistics.init_state(jnp.zeros(F))
     for part in parts:
-        ours, theirs = (
-            update(ours, jnp.asarray(part)),
-            brax_statistics.update(theirs, jnp.asarray(part)),
-        )
+        ours, theirs = update_ours(ours, part), update_theirs(theirs, part)
     whole = np.concatenate(parts).astype(np.float64)
     assert ours.n == len(whole)
     np.testing.assert_allclose(ours.mean, whole.mean(axis=0), rtol=1e-5, atol=1e-5)
@@ -40,7 +41,7 @@ def test_far_from_zero_the_variance_keeps_its_digits() -> None:
     parts = [1000.0 + np.random.default_rng(i).normal(size=(50, F)).astype(np.float32) for i in range(20)]
     ours = init(F)
     for part in parts:
-        ours = update(ours, jnp.asarray(part))
+        ours = update_ours(ours, part)
     np.testing.assert_allclose(ours.variance, np.concatenate(parts).astype(np.float64).var(axis=0), rtol=1e-3)
 
 

@@ -28,6 +28,8 @@ from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 AXES = {"learning_rate": [1e-3, 1e-2, 1e30], "task.rod.mass_kg": [1.3, 1.0]}  # the last step size diverges
 Rows = list[dict[str, str]]
 

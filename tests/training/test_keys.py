@@ -89,9 +89,9 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Seen:
     return seen
 
 
-@pytest.fixture(scope="module", params=[1, 2], ids=["1 shard", "2 shards"])
-def seen(request: pytest.FixtureRequest) -> Seen:
-    """Four unrolls with three minibatches each, and three APG updates."""
+@pytest.fixture(scope="module")
+def seen() -> Seen:
+    """Of two shards: four unrolls with three minibatches each, and three APG updates."""
     config = run_config(
         num_envs=LANES,
         unroll_length=T,
@@ -99,7 +99,7 @@ def seen(request: pytest.FixtureRequest) -> Seen:
         warmup_unrolls=1,
         updates_per_unroll=UPDATES,
         batch_size=BATCH,
-        num_shards=request.param,
+        num_shards=2,
         apg_fraction=0.4,
         apg_num_envs=APG_LANES,
         apg_episode_length=5,

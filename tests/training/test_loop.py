@@ -17,6 +17,8 @@ from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from small_run import comparable_metrics, run_config, train
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 
 @pytest.fixture(autouse=True)
 def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -83,7 +85,6 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path, pendulum: Env, who
         assert comparable_metrics(folder) == comparable_metrics(single)
 
 
-@pytest.mark.usefixtures("quick_compilation")
 @pytest.mark.parametrize("task", ["pendulum", "circle"])
 def test_the_same_seed_gives_the_same_bits_twice(tmp_path: Path, task: str) -> None:
     """State, ring, lanes and metrics."""
