@@ -191,14 +191,14 @@ def step(flight: Flight, action: chex.Array, integral: Integral | None, dt_s: fl
         before = rotors.after(world.rotors, flight.speed, old, jnp.minimum(time_s, late_s))
         return rotors.after(world.rotors, before, new, jnp.maximum(time_s - late_s, 0.0))
 
-    def thrust_at(time_s: chex.Array) -> chex.Array:
-        fraction = rotors.thrust_fraction(world.rotors.curve, speed_at(time_s))
-        return world.motor_factor * physics.motor_max_N * fraction
+    def thrust_at(time_s: float) -> chex.Array:
+        speed = speed_at(jnp.float32(time_s)) if time_s else flight.speed
+        return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, speed)
 
     substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
     body, short_s = flight.body, dt_s / substeps
     for i in range(substeps):
-        begin_s, middle_s = jnp.float32(i * short_s), jnp.float32((i + 0.5) * short_s)
+        begin_s, middle_s = i * short_s, (i + 0.5) * short_s
         body = integrate.midpoint(
             lambda b, t=begin_s: quadrotor.derivative(physics, b, thrust_at(t), world.disturbance),
             lambda b, t=middle_s: quadrotor.derivative(physics, b, thrust_at(t), world.disturbance),

@@ -101,12 +101,12 @@ class Disturbance(NamedTuple):
 def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Disturbance | None = None) -> Body:
     """d(body)/dt under gravity and motor thrust [N] [N], by the Newton–Euler equations."""
     omega = body.twist.body_rate_rad_s
-    torque = jnp.sum(physics.motor_torque_m * thrust, axis=-1)
+    torque = _product(physics.motor_torque_m, thrust)
     rotation_matrix = rotation.matrix(body.pose.attitude)
     if physics.motor_axis is None:
-        acceleration = rotation_matrix[:, 2] * (jnp.sum(thrust) / physics.mass_kg)
+        acceleration = rotation_matrix[:, 2] * (sum(thrust[i] for i in range(thrust.shape[0])) / physics.mass_kg)
     else:
-        acceleration = _product(rotation_matrix, jnp.sum(physics.motor_axis * thrust, axis=-1) / physics.mass_kg)
+        acceleration = _product(rotation_matrix, _product(physics.motor_axis, thrust) / physics.mass_kg)
     if disturbance is not None:
         air_speed = _product(rotation_matrix.T, body.twist.velocity_m_s - disturbance.wind_m_s)  # body
         drag = _product(rotation_matrix, disturbance.drag_N_s_m * air_speed)
@@ -125,8 +125,11 @@ def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Di
 
 
 def _product(matrix: chex.Array, vector: chex.Array) -> chex.Array:
-    """[3, 3], [3] -> [3], exact on a GPU too, unlike a matrix product."""
-    return jnp.sum(matrix * vector, axis=-1)
+    """[3, n], [n] -> [3], exact on a GPU too, unlike a matrix product.
+
+    Term by term: a CPU takes half as long again for sums over an axis as short as this.
+    """
+    return sum((matrix[:, i] * vector[i] for i in range(1, vector.shape[0])), matrix[:, 0] * vector[0])
 
 
 def _solve(matrix: chex.Array, vector: chex.Array) -> chex.Array:
