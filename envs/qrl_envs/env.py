@@ -24,7 +24,6 @@ from qrl_envs.symmetry import Symmetry
 from qrl_envs.task import PendulumTask, QuadrotorTask, Task
 from qrl_envs.uncertainty import Uncertainty
 
-
 WORLD_STREAM = 1_000_003  # folded into a start's key, so that a world does not share the start's random numbers
 
 
@@ -145,7 +144,12 @@ class TaskEnv(abc.ABC):
         x = self._draw(params, rng)
         zero = jnp.float32(0.0)
         return State(
-            Lane(x, params), self._observe(params, x), zero, zero, metrics={}, info={"truncated": zero, "out_of_bounds": zero}
+            Lane(x, params),
+            self._observe(params, x),
+            zero,
+            zero,
+            metrics={},
+            info={"truncated": zero, "out_of_bounds": zero},
         )
 
     @abc.abstractmethod

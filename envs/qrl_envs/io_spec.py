@@ -24,7 +24,7 @@ class ActionPort(NamedTuple):
     low: float
     high: float
     safe: float  # command when an input is invalid: hover thrust, zero torque
-    position_m: tuple[float, float] | None = None  # of a motor: x, y in the body frame
+    position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
 
 

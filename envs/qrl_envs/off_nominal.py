@@ -92,7 +92,7 @@ class OffNominal(RealQuadrotorEnv):
 
     def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
         super().__init__(task, condition.uncertainty, MOST_LATENCY_S)
-        self.params: Any = OffNominalParams(*self.params, jnp.bool_(condition.paper_trial))
+        self.params: Any = OffNominalParams(*self.params, paper_trial=jnp.bool_(condition.paper_trial))  # pyright: ignore[reportCallIssue]
 
     def _start(self, params: Any, key: chex.PRNGKey) -> plant.Body:
         body = super()._start(params, key)

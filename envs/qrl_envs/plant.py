@@ -137,7 +137,6 @@ def draw(ranges: Ranges, physics: Physics, u: chex.Array) -> World:
 NOISES = ("position_noise_m", "velocity_noise_m_s", "attitude_noise_rad", "body_rate_noise_rad_s")
 
 
-
 class Flight(NamedTuple):
     """State of a flight; N motors."""
 

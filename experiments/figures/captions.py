@@ -14,7 +14,7 @@ from experiments.figures.plots import PUBLISHED, Curves, Rate, thousands
 from experiments.figures.runs import PAPER_RATES, RunSpec
 from qrl import tasks
 from qrl.runs.record import RunConfig
-from qrl_envs.perturbations import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
+from qrl_envs.off_nominal import TRIAL_POSITION_M, TRIAL_VELOCITY_M_S
 from qrl_envs.task import CircleReward
 
 CONFIRMED, EXCEEDED, NOT = "confirmed", "exceeded", "not confirmed"

@@ -9,7 +9,7 @@ from qrl import tasks
 from qrl.evaluation.starts import STARTS, evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import record
-from qrl_envs.perturbations import OffNominal, conditions
+from qrl_envs.off_nominal import OffNominal, conditions
 from qrl_envs.task import QuadrotorTask
 
 

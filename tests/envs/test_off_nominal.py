@@ -88,4 +88,3 @@ def test_the_conditions_are_those_that_a_policy_is_judged_by() -> None:
     names = [set(off_nominal.conditions(spec)) for spec in (HOVER, REAL, quadrotor_task("circle"))]
     assert names[1] - names[0] == {"lag_x2", "wind"}
     assert names[0] - names[2] == {"trial"}
-

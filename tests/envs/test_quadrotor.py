@@ -112,7 +112,9 @@ def fly_midpoint(physics: Physics, body: Body, thrust: Array, dt_s: float, steps
 
 
 Integrator = Callable[[Physics, Body, Array, float, int], Body]
-each_integrator = pytest.mark.parametrize(("fly", "order"), [(fly_euler, 1), (fly_midpoint, 2)], ids=["euler", "midpoint"])
+each_integrator = pytest.mark.parametrize(
+    ("fly", "order"), [(fly_euler, 1), (fly_midpoint, 2)], ids=["euler", "midpoint"]
+)
 
 
 def momentum_and_energy(vehicle: Physics, body: Body) -> Array:
@@ -208,7 +210,9 @@ def test_derivative_is_newton_euler(spec: Vehicle) -> None:
         expected = newton_euler(spec, thrust[i], drag, push, wind)(0.0, flat(one(body, i)))
         np.testing.assert_allclose(ours.pose.position_m[i], expected[:3], atol=1e-12)
         np.testing.assert_allclose(ours.twist.velocity_m_s[i], expected[3:6], atol=1e-12)
-        np.testing.assert_allclose(ours.twist.body_rate_rad_s[i], expected[6:9], rtol=3e-7, atol=1e-6)  # parameters are float32
+        np.testing.assert_allclose(
+            ours.twist.body_rate_rad_s[i], expected[6:9], rtol=3e-7, atol=1e-6
+        )  # parameters are float32
 
 
 @pytest.mark.parametrize("yaw", np.linspace(-np.pi, np.pi, 9))

@@ -188,7 +188,9 @@ def test_the_pendulum_swings_either_way() -> None:
             env._advance(env.params, at, jnp.asarray(action))
             for at, action in ((x, np.array([0.7])), (other, turn.action @ [0.7]))
         )
-        np.testing.assert_allclose(env._observe(env.params, turned), turn.observation @ env._observe(env.params, there), atol=1e-5)
+        np.testing.assert_allclose(
+            env._observe(env.params, turned), turn.observation @ env._observe(env.params, there), atol=1e-5
+        )
         np.testing.assert_allclose(same, reward, rtol=1e-5)
     assert found == {1.0, -1.0}
 

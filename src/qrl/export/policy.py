@@ -28,7 +28,7 @@ class ActionSpec:
     low: float
     high: float
     safe: float  # the action when an observation is not finite
-    position_m: tuple[float, float] | None = None  # of a motor: x, y in the body frame
+    position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
 
     @property
