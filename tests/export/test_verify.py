@@ -290,12 +290,10 @@ def test_every_target_is_verified_and_measured(kernel_of: KernelOf) -> None:
     report = verify(policies.policy(ODD, "tanh"), policies.kernel(ODD, "tanh"), kernel_of(ODD, "tanh"), 300)
     assert report.passed == ["host, -O2", "host, -O3 -ffast-math", "M0", "M3", "M4F", "M7"]
     assert report.skipped == []
-    assert [cost.core for cost in report.costs] == ["M0", "M3", "M4F", "M7"]
+    assert [cost.core.name for cost in report.costs] == ["M0", "M3", "M4F", "M7"]
     for cost in report.costs:
         assert 100 < cost.step_i16[0] < cost.step[0] <= cost.step[1]
         assert cost.static_ram == 0
-        assert cost.float32
-        assert cost.float32 > cost.step[0]
 
 
 def changed(kernel: Kernel, layer: int, **values: np.ndarray | int) -> Kernel:
