@@ -35,7 +35,7 @@ class Gate:
         return f"{value:.3g} {self.unit}".strip()
 
     def __str__(self) -> str:
-        return f"{self.name} {self.with_unit(self.measured)} (limit {self.with_unit(self.limit)})"
+        return f"{self.name}: {self.with_unit(self.measured)} (limit {self.with_unit(self.limit)})"
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def gates(measured: Measured) -> list[Gate]:
     ]
     if before.success is not None and after.success is not None:
         lost, gained = int(np.sum(before.success & ~after.success)), int(np.sum(after.success & ~before.success))
-        found.append(Gate(f"successful starts lost of {before.starts:,} ({gained} gained):", lost, 0))
+        found.append(Gate(f"successful starts lost (of {before.starts:,}; {gained} gained)", lost, 0))
     for name, value in before.summary.items():
         if name.startswith("rms_") and name.endswith("_m"):
             label = name.removeprefix("rms_").removesuffix("_m")
