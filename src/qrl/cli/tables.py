@@ -54,4 +54,6 @@ def _cell(name: str, one: dict[str, Any]) -> str:
     value = one[name]
     if name == "env_steps":
         return f"{value:,}"
-    return f"{value:.2f}" if name.startswith("return") else f"{value:.4f}"
+    if name.startswith("return"):
+        return f"{value:.2f}"
+    return f"{value:.1e}" if 0.0 < abs(value) < 5e-4 else f"{value:.4f}"  # an error of 0.1 mm is not 0

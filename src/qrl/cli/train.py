@@ -187,8 +187,8 @@ def _shortfall(last: Row, config: Config) -> str:
     ends = f", and {last['ended_early']:.0%} of its episodes left the bounds" if last["ended_early"] > 0.01 else ""
     longer = f"--num-timesteps {2 * config.num_timesteps}"
     return (
-        f"does its task from {last['success']:.0%} of the reports' starts only{ends}. To try: {longer}, another SEED,"
-        " starts within a tilt (start.tilt_rad in the task file), a vehicle with more thrust"
+        f"does its task from only {last['success']:.0%} of the reports' starts{ends}. To try: {longer}, another SEED,"
+        " starts within a smaller tilt (start.tilt_rad in the task file), a vehicle with more thrust"
     )
 
 
