@@ -28,6 +28,7 @@ def checkpoints(result: dict[str, Any]) -> None:
     columns = {f"{one['env_steps']:,}": one for one in result["checkpoints"]}
     console.print(f"\nseed {result['seed']}, last {len(columns)} checkpoints by environment steps")
     table({head: {k: v for k, v in one.items() if k != "env_steps"} for head, one in columns.items()})
+    console.print()
 
 
 def off_nominal(title: str, result: dict[str, Any]) -> None:
