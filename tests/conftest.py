@@ -53,7 +53,7 @@ def _threads() -> Iterator[None]:
 
 
 def _quickly() -> Iterator[None]:
-    """For what runs for milliseconds, here or in a process that a test starts: XLA's optimisations would take twice the
+    """For what runs for milliseconds, here or in a process that a test starts: XLA's optimizations would take twice the
     time of the rest.
     """
     before = jax.config.read("jax_disable_most_optimizations")

@@ -34,6 +34,7 @@ class Params(NamedTuple):
     reward: Any
     start: Any
     bounds: Any
+    ranges: Any = ()  # of what differs from flight to flight
 
 
 class Lane(NamedTuple):
@@ -179,7 +180,7 @@ class QuadrotorEnv(TaskEnv):
     """Hover or circle with a quadrotor.
 
     Observation [18]: rotation matrix body -> world row-major, position [m] relative to the hover point or the circle's
-    centre and velocity [m/s] (world: x forward, y left, z up), body rates [rad/s] (body). Action [4]: a in [−1, 1] for
+    center and velocity [m/s] (world: x forward, y left, z up), body rates [rad/s] (body). Action [4]: a in [−1, 1] for
     the motor thrusts clip(mg/4 + action_scale·a, 0, max) [N], in the order of the task's motors.
     """
 
@@ -194,19 +195,19 @@ class QuadrotorEnv(TaskEnv):
     def reset_calibration(self, rng: chex.PRNGKey) -> State:
         return self._reset(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
 
-    def _draw(self, params: Params, rng: chex.PRNGKey) -> quadrotor.Body:
+    def _draw(self, params: Params, rng: chex.PRNGKey) -> Any:
         return quadrotor.draw(params.start, rng)
 
-    def _advance(self, params: Params, x: quadrotor.Body, action: chex.Array) -> tuple[quadrotor.Body, chex.Array]:
+    def _advance(self, params: Params, x: Any, action: chex.Array) -> tuple[Any, chex.Array]:
         thrust = quadrotor.thrust_N(params.physics, action)
         body = quadrotor.step(params.physics, x, thrust, self.task.control_period_s)
         return body, params.reward(body, quadrotor.applied_action(params.physics, thrust))
 
-    def _observe(self, params: Params, x: quadrotor.Body) -> chex.Array:
+    def _observe(self, params: Params, x: Any) -> chex.Array:
         del params
         return quadrotor.observe(x)
 
-    def _out_of_bounds(self, params: Params, x: quadrotor.Body) -> chex.Array:
+    def _out_of_bounds(self, params: Params, x: Any) -> chex.Array:
         position_ok = jnp.linalg.norm(x.pose.position_m) <= params.bounds["distance_m"]
         rate_ok = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
         return ~(position_ok & rate_ok)  # negated, so that a NaN ends the episode too
@@ -241,22 +242,13 @@ class QuadrotorEnv(TaskEnv):
         return Evaluation(env, round(spec.duration_s / dt_s), round(spec.return_s / dt_s), measure)
 
 
-class RealParams(NamedTuple):
-    """`Params`, and the ranges of what differs from flight to flight."""
-
-    physics: Any
-    reward: Any
-    start: Any
-    bounds: Any
-    ranges: plant.Ranges
-
-
 class RealQuadrotorEnv(QuadrotorEnv):
     """Hover or circle with a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
 
     Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, then its
-    memory, as the task has it: previous action [N], integral of the position error [3]; then what only a critic may see
-    (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as in `QuadrotorEnv`.
+    memory, as the task has it: previous action [N], integral of the position error [3], on a circle of the height [1];
+    then what only a critic may see (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as in
+    `QuadrotorEnv`.
     """
 
     def __init__(
@@ -264,9 +256,10 @@ class RealQuadrotorEnv(QuadrotorEnv):
     ) -> None:
         super().__init__(task)
         uncertainty = uncertainty or task.uncertainty or Uncertainty()
-        self.params: Any = RealParams(*self.params, plant.ranges(uncertainty, task.vehicle))
-        motors, memory = len(task.vehicle.motors), task.memory
-        self.policy_observation_size = 18 + memory.previous_action * motors + 3 * (memory.integral is not None)
+        self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
+        self._integrator = plant.integrator(task)
+        motors, integrals = len(task.vehicle.motors), len(self._integrator.axes) if self._integrator else 0
+        self.policy_observation_size = 18 + task.memory.previous_action * motors + integrals
         self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
         latency_s = uncertainty.latency_s[1] if most_latency_s is None else most_latency_s
         self._steps_late = plant.delayed_steps(latency_s, task.control_period_s)
@@ -290,31 +283,31 @@ class RealQuadrotorEnv(QuadrotorEnv):
             self._start(params, rng),
             plant.draw(params.ranges, params.physics, u),
             self._steps_late,
-            self.task.memory.integral,
+            self._integrator,
             self.task.control_period_s,
         )
 
     def _advance(self, params: Params, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
         x = x._replace(world=jax.lax.stop_gradient(x.world))
-        flight = plant.step(x, action, self.task.memory.integral, self.task.control_period_s)
+        flight = plant.step(x, action, self._integrator, self.task.control_period_s)
         return flight, params.reward(flight.body, flight.previous_action)
 
     def _observe(self, params: Params, x: plant.Flight) -> chex.Array:
-        memory = self.task.memory
-        seen = plant.observe(x, memory.previous_action, memory.integral)
+        seen = plant.observe(x, self.task.memory.previous_action)
         return jnp.concatenate([seen, plant.privileged(x, params.physics, self.task.control_period_s)])
 
     def _out_of_bounds(self, params: Params, x: plant.Flight) -> chex.Array:
         return super()._out_of_bounds(params, x.body)
 
     def symmetry(self, u: chex.Array) -> Symmetry:
-        plain, memory = super().symmetry(u), self.task.memory
+        plain = super().symmetry(u)
         world, body = plain.observation[9:12, 9:12], plain.observation[15:18, 15:18]
         parts = [plain.observation]
-        if memory.previous_action:
+        if self.task.memory.previous_action:
             parts.append(plain.action)
-        if memory.integral is not None:
-            parts.append(world)
+        if self._integrator:
+            axes = jnp.array(self._integrator.axes)
+            parts.append(world[axes[:, None], axes])
         parts += [world, body, jnp.eye(plant.PRIVILEGED - 6), plain.action]
         return Symmetry(jax.scipy.linalg.block_diag(*parts), plain.action)
 

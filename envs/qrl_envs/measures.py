@@ -107,7 +107,7 @@ def failed_starts(success: np.ndarray) -> list[int]:
 def list_failures(task: Task, observations: np.ndarray, success: np.ndarray, limit: int) -> list[dict[str, Any]]:
     """For the first `limit` failed flights: the index of the start, the start, and the reason of the failure.
 
-    `observations` [n, K + 1, F] are NaN after an episode's early end. Reasons: "fled" (beyond the bound of distance),
+    `observations` [n, K + 1, F] are NaN after an episode's early end. Reasons: "too far" (beyond the bound of distance),
     "tumbled" (of body rate), "did not settle", or "not finite".
     """
     return [
@@ -149,4 +149,4 @@ def _reason(task: Task, observations: np.ndarray) -> str:
     next_distance_m = np.linalg.norm(last[9:12] + task.control_period_s * last[12:15])
     distance = next_distance_m / task.bounds.distance_m
     rate = np.linalg.norm(last[15:18]) / task.bounds.body_rate_rad_s
-    return "fled" if distance >= rate else "tumbled"
+    return "too far" if distance >= rate else "tumbled"

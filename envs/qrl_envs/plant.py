@@ -14,7 +14,7 @@ import numpy as np
 from qrl_envs import integrate, quadrotor, rotation, rotors
 from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
 from qrl_envs.rotors import Rotors
-from qrl_envs.task import Integral
+from qrl_envs.task import CircleReward, QuadrotorTask
 from qrl_envs.uncertainty import Uncertainty
 from qrl_envs.vehicle import Vehicle
 
@@ -146,8 +146,24 @@ class Flight(NamedTuple):
     world: World
     sensed: Body  # the body as measured
     previous_action: chex.Array  # [N] applied
-    integral_m_s: chex.Array  # [3] of the position error, gated (`task.Integral`)
+    integral_m_s: chex.Array  # [k] of the position error along the integrator's axes
     steps: chex.Array  # int32 []
+
+
+class Integrator(NamedTuple):
+    """`task.Integral`, and which axes of the position are an error: all in hover, the height alone on a circle."""
+
+    axes: tuple[int, ...]
+    radius_m: float
+    limit_m_s: float
+
+
+def integrator(task: QuadrotorTask) -> Integrator | None:
+    """The integrator of a task whose policy observes the integral, else None."""
+    if (integral := task.memory.integral) is None:
+        return None
+    axes = (2,) if isinstance(task.reward, CircleReward) else (0, 1, 2)
+    return Integrator(axes, integral.radius_m, integral.limit_m_s)
 
 
 def delayed_steps(latency_s: float, dt_s: float) -> int:
@@ -155,7 +171,7 @@ def delayed_steps(latency_s: float, dt_s: float) -> int:
     return int(np.ceil(latency_s / dt_s - 1e-6)) + 1
 
 
-def begin(body: Body, world: World, steps_late: int, integral: Integral | None, dt_s: float) -> Flight:
+def begin(body: Body, world: World, steps_late: int, integrator: Integrator | None, dt_s: float) -> Flight:
     """A flight's state at its start: rotors at the speed of hover, a previous action of 0."""
     physics = world.physics
     hover = rotors.speed_of(world.rotors.curve, physics.hover_thrust_N / physics.motor_max_N)
@@ -168,12 +184,14 @@ def begin(body: Body, world: World, steps_late: int, integral: Integral | None, 
         world=world,
         sensed=sensed,
         previous_action=jnp.zeros(motors),
-        integral_m_s=integrated(jnp.zeros(3), sensed.pose.position_m, integral, dt_s),
+        integral_m_s=integrated(
+            jnp.zeros(len(integrator.axes) if integrator else 0), sensed.pose.position_m, integrator, dt_s
+        ),
         steps=jnp.int32(0),
     )
 
 
-def step(flight: Flight, action: chex.Array, integral: Integral | None, dt_s: float) -> Flight:
+def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s: float) -> Flight:
     """One control period under `action` [N]."""
     world, physics = flight.world, flight.world.physics
     thrust = quadrotor.thrust_N(physics, action)
@@ -214,7 +232,7 @@ def step(flight: Flight, action: chex.Array, integral: Integral | None, dt_s: fl
         world=world,
         sensed=sensed,
         previous_action=quadrotor.applied_action(physics, thrust),
-        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m, integral, dt_s),
+        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m, integrator, dt_s),
         steps=steps,
     )
 
@@ -230,12 +248,13 @@ def _renormalized(body: Body) -> Body:
     )
 
 
-def integrated(total: chex.Array, position_m: chex.Array, integral: Integral | None, dt_s: float) -> chex.Array:
-    """The integral [3] after a period at `position_m` [3] (`task.Integral`)."""
-    if integral is None:
+def integrated(total: chex.Array, position_m: chex.Array, integrator: Integrator | None, dt_s: float) -> chex.Array:
+    """The integral [k] after a period at `position_m` [3] (`task.Integral`)."""
+    if integrator is None:
         return total
-    near = jnp.maximum(0.0, 1.0 - jnp.sum(position_m**2) / integral.radius_m**2)
-    return jnp.clip(total + dt_s * position_m * near**2, -integral.limit_m_s, integral.limit_m_s)
+    error = jnp.stack([position_m[axis] for axis in integrator.axes])
+    near = jnp.maximum(0.0, 1.0 - jnp.sum(error**2) / integrator.radius_m**2)
+    return jnp.clip(total + dt_s * error * near**2, -integrator.limit_m_s, integrator.limit_m_s)
 
 
 def _noise_table() -> np.ndarray:
@@ -262,14 +281,10 @@ def sense(world: World, body: Body, steps: chex.Array) -> Body:
     )
 
 
-def observe(flight: Flight, previous_action: bool, integral: Integral | None) -> chex.Array:
-    """What a policy observes: the measured body [18], then its memory: previous action [N], integral [3]."""
-    parts = [quadrotor.observe(flight.sensed)]
-    if previous_action:
-        parts.append(flight.previous_action)
-    if integral is not None:
-        parts.append(flight.integral_m_s)
-    return jnp.concatenate(parts)
+def observe(flight: Flight, previous_action: bool) -> chex.Array:
+    """What a policy observes: the measured body [18], then its memory: previous action [N], integral [k]."""
+    memory = [flight.previous_action, flight.integral_m_s][0 if previous_action else 1 :]
+    return jnp.concatenate([quadrotor.observe(flight.sensed), *memory])
 
 
 PRIVILEGED = 14  # numbers of `privileged`, besides one for each motor

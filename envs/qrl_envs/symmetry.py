@@ -1,7 +1,8 @@
 """Symmetries of the tasks: maps of observations and actions that commute with a step and keep reward and end.
 
 A transformed trajectory is one of the transformed behavior policy, with the same log-densities, so an off-policy
-learner may train on it too (data augmentation). The distribution of starts need not be symmetric.
+learner may train on it too (data augmentation). The distribution of starts need not be symmetric: it weights
+the objective, and no target depends on it.
 """
 
 from typing import NamedTuple

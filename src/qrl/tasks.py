@@ -185,10 +185,12 @@ INTEGRAL_SCALE_1_M_S = 6.0
 
 def _memory_scale(task: task_spec.QuadrotorTask) -> list[float]:
     """Scales of what an environment of a real vehicle observes beside the 18 numbers of the paper's."""
-    size = worlds.from_task(task).observation_size - 18
+    env = worlds.from_task(task)
     motors = len(task.vehicle.motors) * task.memory.previous_action
-    integral = 3 * (task.memory.integral is not None)
-    return [1.0] * motors + [INTEGRAL_SCALE_1_M_S] * integral + [1.0] * (size - motors - integral)
+    integrals = (env.policy_observation_size or 18) - 18 - motors
+    return (
+        [1.0] * motors + [INTEGRAL_SCALE_1_M_S] * integrals + [1.0] * (env.observation_size - 18 - motors - integrals)
+    )
 
 
 def check(env: Env, learner: Config, where: str) -> None:

@@ -258,7 +258,7 @@ def test_failures_are_those_that_fail_again() -> None:
 
 @pytest.mark.parametrize(
     ("part", "last", "reason"),
-    [(12, 40.0, "fled"), (15, 99.0, "tumbled"), (None, 0.0, "did not settle")],
+    [(12, 40.0, "too far"), (15, 99.0, "tumbled"), (None, 0.0, "did not settle")],
 )
 def test_why_a_flight_failed(part: int | None, last: float, reason: str) -> None:
     flight = np.tile(level((19.7, 0.0, 0.0) if part == 12 else (1.0, 0.0, 0.0)), (6, 1))

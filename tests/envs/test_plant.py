@@ -13,7 +13,6 @@ from test_quadrotor import flat, newton_euler
 
 from qrl_envs import plant, quadrotor, rotors, task
 from qrl_envs.env import RealQuadrotorEnv
-from qrl_envs.task import Integral
 from qrl_envs.uncertainty import Uncertainty
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
@@ -246,12 +245,15 @@ def test_memory_is_what_a_literal_loop_says() -> None:
 
 def test_the_integral_is_bounded() -> None:
     total = jnp.array([0.5999, -0.5999, 0.0])
-    after = plant.integrated(total, jnp.array([0.1, -0.1, 0.1]), Integral(), 0.1)
+    after = plant.integrated(total, jnp.array([0.1, -0.1, 0.1]), plant.Integrator((0, 1, 2), 0.5, 0.6), 0.1)
     np.testing.assert_allclose(after, [0.6, -0.6, 0.01 * (1 - 0.03 / 0.25) ** 2], atol=1e-6)
 
 
 def test_the_policy_sees_the_first_numbers_and_the_critic_all() -> None:
     env = RealQuadrotorEnv(real_task("hexa"))
     assert (env.policy_observation_size, env.observation_size, env.action_size) == (18 + 6 + 3, 18 + 6 + 3 + 14 + 6, 6)
+    circle = task.load("circle", "hexa")
+    assert isinstance(circle, task.QuadrotorTask)
+    assert RealQuadrotorEnv(circle).policy_observation_size == 18 + 6 + 1  # the height's integral alone
     nothing = RealQuadrotorEnv(real_task("hexa", memory={}))
     assert nothing.policy_observation_size == 18

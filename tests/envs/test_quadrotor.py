@@ -21,6 +21,7 @@ assert isinstance(HOVER, task.QuadrotorTask)
 PAPERS = HOVER.vehicle
 GRAVITY = 9.81
 UP = np.array([0.0, 0.0, 1.0])
+NOTHING, NO_PUSH = np.zeros(3), np.zeros(6)
 FRONT_LEFT, REAR_LEFT, REAR_RIGHT, FRONT_RIGHT = range(4)
 
 # Nothing equal, nothing symmetric: a swapped index or sign shows.
@@ -128,7 +129,7 @@ def momentum_and_energy(vehicle: Physics, body: Body) -> Array:
 
 
 def newton_euler(
-    vehicle: Vehicle, thrust: Array, drag: Array = np.zeros(3), push: Array = np.zeros(6), wind: Array = np.zeros(3)
+    vehicle: Vehicle, thrust: Array, drag: Array = NOTHING, push: Array = NO_PUSH, wind: Array = NOTHING
 ) -> Callable[[float, Array], Array]:
     """The equations of motion, written apart: r × F for each motor, and the attitude as a rotation matrix.
 

@@ -12,7 +12,7 @@ ACTIVATIONS: dict[str, Callable[[chex.Array], chex.Array]] = {"relu": nn.relu, "
 
 
 class MLP(nn.Module):
-    """Fully connected network with orthogonal initialisation; [..., F] -> [..., outputs]."""
+    """Fully connected network with orthogonal initialization; [..., F] -> [..., outputs]."""
 
     hidden: tuple[int, ...]
     outputs: int

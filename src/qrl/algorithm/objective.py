@@ -48,5 +48,5 @@ def perceptron(
     epsilon: float | chex.Array = 0.2,
     xi: float | chex.Array | None = None,
 ) -> chex.Array:
-    """min[dominance, margin] for each sample, to be maximised (paper, equ:perceptronLike); shape [...]."""
+    """min[dominance, margin] for each sample, to be maximized (paper, equ:perceptronLike); shape [...]."""
     return jnp.minimum(dominance(log_pi, log_mu, advantage, form), margin(advantage, epsilon, xi))

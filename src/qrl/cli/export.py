@@ -15,12 +15,12 @@ from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun
-from qrl.export import baseline, emit, vectors
+from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import Kernel
 from qrl.export.policy import Policy
-from qrl.export.quantize import UnsupportedNetwork, quantize, si_layers
+from qrl.export.quantize import UnsupportedNetwork, quantize
 from qrl.export.report import FlightStats, Measured, gates, report
 from qrl.export.verify import VerificationReport, verify
 from qrl_envs.specfile import BadInput
@@ -43,7 +43,9 @@ def export(args: argparse.Namespace) -> int:
         console.print(f"{'instructions per inference':<27} {heads}")
     for cost in verification.costs:
         mean, mean_i16 = cost.step[0], cost.step_i16[0]
-        console.print(f"{cost.core:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {cost.flash:>6,} B {max(cost.stack):>5} B")
+        console.print(
+            f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {cost.flash:>6,} B {max(cost.stack):>5} B"
+        )
     duration = clock(time.perf_counter() - start_time)
     console.print(f"done in {duration}: {run.folder / 'export'}/qrl_policy.c, .h, report.md")
     return DONE
@@ -96,12 +98,6 @@ def _measured(
     def integer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
         return reference.step(kernel, observation)[1]
 
-    network = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
-
-    def naive(observation: NDArray[np.float32]) -> NDArray[np.floating]:
-        outputs = baseline.infer(network, baseline.to_int8(network, observation))
-        return np.clip(outputs * network.act_scale, *policy.limits)
-
     keys = evaluation_starts(starts)
     float_flights = run.fly(keys)
     integer_flights = run.fly_host_policy(integer, keys)
@@ -114,7 +110,6 @@ def _measured(
     tail = run.tail_steps()
     return Measured(
         accuracy=accuracy(policy, integer, flown),
-        naive=accuracy(policy, naive, calibration.subsample(flown, calibration.SAMPLES)),
         float_flights=_stats(policy, float_flights, tail),
         integer_flights=_stats(policy, integer_flights, tail),
         verification=verification(),

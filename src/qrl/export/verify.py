@@ -8,24 +8,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qrl.export import baseline, targets, vectors
+from qrl.export import targets, vectors
 from qrl.export.kernel import Kernel
 from qrl.export.policy import Policy
-from qrl.export.quantize import si_layers
-from qrl.export.targets import CORES, FIRMWARE, STRICT, Core, Counts, VerificationFailed
+from qrl.export.targets import CORES, FIRMWARE, STRICT, Core, VerificationFailed
 from qrl.export.vectors import Outputs, Vectors
-
-BASELINE_VECTORS = 20
 
 
 class Cost(NamedTuple):
     """Cost on one core; `step` and `step_i16`: instructions per inference, mean over flights, maximum over vectors."""
 
-    core: str
+    core: Core
     step: tuple[float, float]
     step_i16: tuple[float, float]
-    float32: float | None  # instructions of the same network in plain float32; None if it does not fit the core
-    naive_int8: float | None  # and in naive int8
     flash: int  # bytes of text and data of the one object, -O2, all entry points
     static_ram: int  # bytes
     stack: tuple[int, int, int]  # bytes, of each entry point and the self-test, libraries included
@@ -58,9 +53,8 @@ def verify(policy: Policy, kernel: Kernel, folder: Path, n: int) -> Verification
         if missing := targets.missing_tools():
             skipped.append(f"Cortex-M and its costs: {', '.join(missing)} not found")
         else:
-            baseline.write(Path(work) / "baseline", si_layers(policy), policy.activation, policy.calibration)
             for core in CORES:
-                jobs.append((core.name, pool.submit(_on_core, core, folder, Path(work), policy, expected)))
+                jobs.append((core.name, pool.submit(_on_core, core, folder, Path(work), expected)))
         for name, job in jobs:
             cost = job.result()
             passed.append(name)
@@ -72,34 +66,20 @@ def _on_host(folder: Path, work: Path, flags: tuple[str, ...], expected: Vectors
     compare(name, targets.run_host(folder, work, flags, expected.obs, expected.obs_i16), expected.outputs)
 
 
-def _on_core(core: Core, folder: Path, work: Path, policy: Policy, expected: Vectors) -> Cost:
+def _on_core(core: Core, folder: Path, work: Path, expected: Vectors) -> Cost:
     outputs, counts = targets.run_core(core, folder, work, targets.RELEASE, expected.obs, expected.obs_i16)
     compare(core.name, outputs, expected.outputs)
     size = targets.size(core, folder, work)
-    obs = policy.calibration[:: max(1, len(policy.calibration) // BASELINE_VECTORS)][:BASELINE_VECTORS]
-    plain = _baseline_counts(core, work, policy, obs)
     flights = slice(0, len(expected.obs) // 2)
     return Cost(
-        core=core.name,
+        core=core,
         step=(float(counts.f32[flights].mean()), float(counts.f32.max())),
         step_i16=(float(counts.i16[flights].mean()), float(counts.i16.max())),
-        float32=plain and float(plain.f32.mean()),
-        naive_int8=plain and float(plain.i16.mean()),
         flash=size.text + size.data,
         static_ram=size.data + size.bss,
         stack=(counts.stack_f32, counts.stack_i16, counts.stack_selftest),
         library=size.library,
     )
-
-
-def _baseline_counts(core: Core, work: Path, policy: Policy, obs: np.ndarray) -> Counts | None:
-    """Costs of the same network written plainly; None if it does not fit the core."""
-    network = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
-    obs_i16, flags = baseline.to_int8(network, obs), ("-std=c99", "-O2")
-    try:
-        return targets.run_core(core, work / "baseline", work, flags, obs, obs_i16, baseline.LIBRARIES)[1]
-    except VerificationFailed:
-        return None
 
 
 def compare(target: str, found: Outputs, expected: Outputs) -> None:

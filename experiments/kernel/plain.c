@@ -15,7 +15,7 @@ struct layer {
     const int8_t *table; /* of the activation, 256 entries; null for the last layer */
 };
 
-#include "baseline_data.h"
+#include "plain_data.h"
 
 int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE])
 {
