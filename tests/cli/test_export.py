@@ -17,7 +17,7 @@ from qrl.export.quantize import UnsupportedNetwork
 from qrl.export.targets import VerificationFailed
 
 LEAST = ("--starts", "8", "--vectors", "500")
-FILES = policies.EMITTED | {"report.md"}
+FILES = policies.emitted_files("qrl_pendulum") | {"report.md"}
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +42,7 @@ def test_an_export_is_whole_and_the_same_again(run: Path, capsys: pytest.Capture
     assert qrl("export", run, *LEAST) == 0
     said = capsys.readouterr().out
     assert "skipped Cortex-M and its costs: the cross compiler not found" in said
-    assert f"{run}/export/qrl_policy.c" in said
+    assert f"{run}/export/qrl_pendulum.c" in said
     first = contents(run / "export")
     assert set(first) == FILES
     manifest = json.loads(first["manifest.json"])
@@ -76,7 +76,7 @@ def test_a_verification_that_fails_leaves_what_was_there(
     for had in (False, True):
         if had:
             (run / "export").mkdir()
-            (run / "export" / "qrl_policy.c").write_text("earlier")
+            (run / "export" / "qrl_pendulum.c").write_text("earlier")
             before = contents(run)
         capsys.readouterr()
         assert qrl("export", run, *LEAST) == 1
@@ -129,7 +129,7 @@ def test_a_foreign_environment_exports(
     assert [port["name"] for port in manifest["obs"]] == ["o0", "o1"]
     assert [(port["name"], port["unit"]) for port in manifest["act"]] == [("a0", "?")]
     assert manifest["control_period_s"] == 0.02
-    assert set(contents(run / "export")) == FILES
+    assert set(contents(run / "export")) == policies.emitted_files("qrl_fast") | {"report.md"}
 
 
 # -- refused -------------------------------------------------------------------------------------------------

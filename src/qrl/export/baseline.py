@@ -103,12 +103,12 @@ def _array(kind: str, name: str, values: Iterable[str]) -> str:
     return f"static const {kind} {name}[] = {{{', '.join(values)}}};\n"
 
 
-def write(folder: Path, layers: Layers, activation: str, obs: Floats) -> None:
-    """A kernel folder for `run_core(..., libraries=LIBRARIES)`; its int16 entry point is the naive int8 network."""
+def write(folder: Path, layers: Layers, activation: str, obs: Floats) -> Path:
+    """A kernel in `folder` for `run_core(..., libraries=LIBRARIES)`; its int16 entry is the naive int8 network."""
     folder.mkdir(parents=True, exist_ok=True)
     inputs, outputs = layers[0][0].shape[0], layers[-1][0].shape[1]
     header = (SOURCES / "baseline.h").read_text(encoding="utf-8")
-    sizes = f"#define QRL_POLICY_OBS_SIZE {inputs}\n#define QRL_POLICY_ACT_SIZE {outputs}\n"
-    (folder / "qrl_policy.h").write_text(sizes + header, encoding="utf-8")
+    sizes = f"#define BASELINE_OBS_SIZE {inputs}\n#define BASELINE_ACT_SIZE {outputs}\n"
+    (folder / "baseline.h").write_text(sizes + header, encoding="utf-8")
     (folder / "baseline_data.h").write_text(data(layers, activation, obs), encoding="utf-8")
-    shutil.copy(SOURCES / "baseline.c", folder / "qrl_policy.c")
+    return Path(shutil.copy(SOURCES / "baseline.c", folder))

@@ -1,5 +1,10 @@
 #include <stdint.h>
 
-int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]);
-int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]);
-int qrl_policy_selftest(void);
+typedef struct {
+    uint8_t unused;
+} baseline_state;
+
+void baseline_reset(baseline_state *state);
+int baseline_step(baseline_state *state, const float obs[BASELINE_OBS_SIZE], float act[BASELINE_ACT_SIZE]);
+int baseline_step_i16(baseline_state *state, const int16_t obs[BASELINE_OBS_SIZE], int16_t act[BASELINE_ACT_SIZE]);
+int baseline_selftest(void);
