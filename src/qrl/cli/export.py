@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +20,7 @@ from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
 from qrl.export import baseline, emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
-from qrl.export.kernel import Kernel
+from qrl.export.kernel import Ints, Kernel
 from qrl.export.policy import Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, respond, si_layers
 from qrl.export.report import FlightStats, Measured, gates, report
@@ -113,10 +112,10 @@ def _measured(
 ) -> Measured:
     """Fly both policies from the starts of an evaluation, then wait for the verification."""
 
-    def integer(state: NDArray[np.int32], observation: NDArray[np.float32]) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    def integer(state: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
         """The kernel has the measured observation only, and keeps its own memory."""
-        state, _, action = reference.step(kernel, state.astype(np.int64), observation[:, :measured])
-        return state, action
+        after, _, action = reference.step(kernel, state.astype(np.int64), observation[:, :measured])
+        return after, action
 
     measured = len(policy.observations)
     network = baseline.naive(si_layers(policy), policy.activation, policy.calibration)

@@ -31,7 +31,7 @@ from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask
 from qrl_envs.vehicle import Vehicle, shipped_vehicles, vehicle_data
 
-HostStep = Callable[[NDArray[np.int32], NDArray[np.float32]], tuple[NDArray[Any], NDArray[np.floating]]]
+HostStep = Callable[[NDArray[np.integer], NDArray[np.float32]], tuple[NDArray[Any], NDArray[np.floating]]]
 """Memory [n, S] and observation [n, I] of n flights -> next memory, and action [n, A] in SI units."""
 
 
@@ -82,7 +82,7 @@ class TrainedRun:
         return self._programs.fly(self._learner, env or self.env, starts)
 
     def fly_host_policy(
-        self, step: HostStep, memory: NDArray[np.int32], starts: chex.PRNGKey, from_envelope: float = 0.0
+        self, step: HostStep, memory: NDArray[np.integer], starts: chex.PRNGKey, from_envelope: float = 0.0
     ) -> Flights:
         """Flights of a NumPy policy in the run's environment; a fraction `from_envelope` starts in the envelope.
 
@@ -92,7 +92,7 @@ class TrainedRun:
         _, actions = self._specs()
         offset, scale = (np.array([getattr(action, name) for action in actions]) for name in ("offset", "scale"))
 
-        def normalized(memory: NDArray[np.int32], observation: NDArray[np.float32]) -> tuple[Any, Any]:
+        def normalized(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Any, Any]:
             memory, action = step(np.asarray(memory), np.asarray(observation))
             return memory.astype(np.int32), ((action - offset) / scale).astype(np.float32)
 
@@ -130,7 +130,7 @@ class TrainedRun:
         """
         policy = self.float_policy(memory)
 
-        def step(memory: NDArray[np.int32], observation: NDArray[np.float32]) -> tuple[NDArray[np.int32], Any]:
+        def step(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[NDArray[np.integer], Any]:
             return memory, policy(inputs_in_si(policy, observation))  # the environment keeps the memory
 
         starts = calibration_starts(calibration.STARTS)

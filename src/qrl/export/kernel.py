@@ -120,7 +120,7 @@ def accumulator_bound(kernel: Kernel) -> int:
 
 
 def _check_fields(kernel: Kernel) -> None:
-    ranges = [
+    ranges: list[tuple[str, Ints, Ints | int, Ints | int]] = [
         ("an input's scale", kernel.scale, 2**15, 2**16 - 1),
         ("an input's exponent", kernel.exponent, -(2**15), INT16),
         ("an input's range", kernel.obs_min, -INT16, 0),

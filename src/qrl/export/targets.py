@@ -216,8 +216,8 @@ def _read(
         for guard, what in (("guard", "outputs"), ("state_guard", "state")):
             if np.any(records[guard] != GUARD):
                 raise VerificationFailed(f"{where}: {entry} writes past the end of its {what}")
-    outputs = Outputs(*(each[part] for each in (f32, i16) for part in ("status", "act", "state")), fields["selftest"])
-    return outputs, fields, (f32["elapsed"], i16["elapsed"])
+    both = [each[part] for each in (f32, i16) for part in ("status", "act", "state")]
+    return Outputs(*both, selftest=fields["selftest"]), fields, (f32["elapsed"], i16["elapsed"])
 
 
 def _layout(fields: dict[str, int], kind: str) -> np.dtype:
