@@ -53,7 +53,7 @@ def _threads() -> Iterator[None]:
 
 
 def _quickly() -> Iterator[None]:
-    """For what runs for milliseconds: XLA's optimisations would take twice the time of the rest."""
+    """For what runs for milliseconds: XLA's optimizations would take twice the time of the rest."""
     before = jax.config.read("jax_disable_most_optimizations")
     jax.config.update("jax_disable_most_optimizations", True)
     yield

@@ -38,7 +38,7 @@ def test_gradients_are_those_of_the_plain_formula(outputs: int, shape: tuple[int
 
 @pytest.mark.parametrize("axes", [(0, 0), (None, 0), (0, None)], ids=["members", "inputs", "parameters"])
 def test_gradients_of_members_side_by_side(axes: tuple[int | None, int | None]) -> None:
-    """Under vmap, within a rematerialised scan, as flights are differentiated."""
+    """Under vmap, within a rematerialized scan, as flights are differentiated."""
     network = MLP((8,), 2, "tanh", final_gain=1.0)
     x = jax.random.normal(jax.random.PRNGKey(0), (3, 4, F))
     many = jax.vmap(lambda key: network.init(key, x[0]))(jax.random.split(jax.random.PRNGKey(2), 3))

@@ -135,7 +135,7 @@ def test_samples_are_whole_trajectories_of_filled_slots(adds: int, ring_after: l
 
 @pytest.mark.parametrize("adds", [1, SLOTS - 1, SLOTS, SLOTS + 1, 2 * SLOTS + 2])
 def test_samples_are_uniform_and_independent(adds: int, ring_after: list[ReplayBuffer]) -> None:
-    """Chi-square over trajectories, and over pairs of neighbours in the minibatch (drawn with replacement)."""
+    """Chi-square over trajectories, and over pairs of neighbors in the minibatch (drawn with replacement)."""
     count = 0
     pairs = np.zeros((len(kept(adds)), len(kept(adds))))
     for seed in range(16):

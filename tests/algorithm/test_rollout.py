@@ -317,10 +317,10 @@ def test_members_side_by_side_fly_as_they_would_alone() -> None:
             np.testing.assert_allclose(ours[member], expected, rtol=1e-5, atol=1e-5)
 
 
-def test_a_lane_flies_as_it_would_without_its_neighbours() -> None:
+def test_a_lane_flies_as_it_would_without_its_neighbors() -> None:
     """Starts, noise and stagger are a lane's own: half the lanes alone make the transitions that they make in a whole.
 
-    Neighbours decide when starts are drawn, and must not decide which.
+    Neighbors decide when starts are drawn, and must not decide which.
     """
     begun = begin(MARKED, seed=7)
     whole = fly(MARKED, begun, seed=7).steps

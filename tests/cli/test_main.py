@@ -75,7 +75,7 @@ def number():
     return 3
 
 def fails():
-    raise RuntimeError("no licence")
+    raise RuntimeError("no license")
 """
 
 
@@ -87,7 +87,7 @@ def test_a_task_is_a_function_of_the_users(tmp_path: Path, monkeypatch: pytest.M
     assert (record.name, record.spec, tasks.folder_name(record)) == ("my_worlds:make", None, "make")
     assert tasks.environment(record).action_size == 1
     for name, why in {
-        "my_worlds:fails": "no licence",
+        "my_worlds:fails": "no license",
         "my_worlds:number": "found int without reset, step",
         "my_worlds:mak": "did you mean 'make'",
         "my_world:make": "No module named 'my_world'",

@@ -118,6 +118,15 @@ def test_the_page_holds_the_flights(name: str) -> None:
         np.testing.assert_allclose(np.transpose(last), thrust, atol=5e-3)
 
 
+def test_the_speed_of_a_clockwise_circle_has_an_axis_the_right_way_up() -> None:
+    task, flown = tasks.load("circle"), made_up("circle")
+    reward = task.evaluation.reward.model_copy(update={"speed_m_s": -2.0})
+    task = task.model_copy(update={"evaluation": task.evaluation.model_copy(update={"reward": reward})})
+    flown.observations[..., [10, 13]] *= -1.0  # mirrored: the flights are clockwise too
+    low, high = data_of(viewer.page(task, "mine", flown))["panels"][0]["limits"]
+    assert -6.5 < low <= -3.0 < high < 2.5
+
+
 def test_motors_are_told_apart_by_their_place() -> None:
     data = data_of(viewer.page(tasks.load("hover"), "mine", made_up("hover")))
     motors, lines = data["vehicle"]["motors"], data["panels"][-1]["lines"]

@@ -118,7 +118,7 @@ def test_one_sample_outside_fails_in_the_tail_alone(task: str) -> None:
 
 
 @pytest.mark.parametrize(("distance", "success"), [(0.099, 1), (0.101, 0)])
-def test_hover_succeeds_within_a_tenth_of_a_metre(distance: float, success: int) -> None:
+def test_hover_succeeds_within_a_tenth_of_a_meter(distance: float, success: int) -> None:
     """In a straight line, not along each axis."""
     result = hover_measures(hovering(1, distance))
     assert result["success"] == success

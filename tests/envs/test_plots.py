@@ -103,7 +103,7 @@ def test_one_flight_is_enough() -> None:
     odd = task.load("circle").model_copy(update={"description": "a title is no mathematics: $\\frac$"})
     figure = flights_of.figure(odd, approach("circle", 1))
     assert can_be_drawn(figure)
-    assert figure.axes[0].get_title() == "the first 1 of 1 flights"
+    assert figure.axes[0].get_title() == ""
     assert errors_of.figure(task.load("circle"), approach("circle", 1)).axes[0].get_title() == "all 1 flights"
 
 
@@ -315,3 +315,13 @@ def test_seeds_that_reported_at_other_times_are_interpolated() -> None:
     np.testing.assert_array_equal(steps, [0.75e5, 1e5, 1.5e5, 2e5, 2.25e5])
     np.testing.assert_allclose(values[0], [np.nan, 0, 5, 10, np.nan])
     np.testing.assert_allclose(values[1], [0, 5 / 3, 5, 5 + 4 / 3, 7])
+
+
+def test_the_speed_of_a_clockwise_circle_is_shown_the_right_way_up() -> None:
+    for speed in (2.0, -2.0):
+        reward = task.load("circle").evaluation.reward.model_copy(update={"speed_m_s": speed})
+        spec = task.load("circle").model_copy(update={"reward": reward})
+        spec = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"reward": reward})})
+        mirrored = approach("circle") * np.where(np.isin(np.arange(18), (10, 13)), np.sign(speed), 1.0)
+        low, high = flights_of.figure(spec, mirrored).axes[2].get_ylim()
+        assert min(-speed, 3 * speed) <= low < speed < high <= max(-speed, 3 * speed)

@@ -76,7 +76,7 @@ def flown(name: str, observations: np.ndarray, succeed: list[bool]) -> PolicyFli
 
 
 def circling(n: int, vx: float = 2.0, vy: float = 2.0) -> np.ndarray:
-    """Flights of 12 s round the circle at 2 rad/s, each half a metre higher up x than the one before."""
+    """Flights of 12 s round the circle at 2 rad/s, each half a meter higher up x than the one before."""
     t = np.arange(1201) * 0.01
     found = np.zeros((n, 1201, 18))
     found[..., 9], found[..., 10] = np.cos(2 * t) + 0.5 * np.arange(n)[:, None], np.sin(2 * t)

@@ -176,7 +176,7 @@ def layered(rng: np.random.Generator, sizes: tuple[int, ...], activation: str = 
 @ACTIVATIONS
 @pytest.mark.parametrize("seed", range(5))
 def test_any_integers_are_the_literal_arithmetic(activation: str, seed: int) -> None:
-    """Not only those of a quantiser: saturation in every layer."""
+    """Not only those of a quantizer: saturation in every layer."""
     rng = np.random.default_rng(seed)
     kernel = layered(rng, (6, 9, 5, 3), activation)
     x = rng.integers(-INT16 - 1, INT16 + 1, (30, 6)).astype(np.int16)

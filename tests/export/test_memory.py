@@ -26,7 +26,7 @@ from qrl.export.verify import CORE_STEPS, HOST_STEPS, compare, verify
 
 WHICH = pytest.mark.parametrize("which", REMEMBERING)
 MANY, FEW = 10_000, 600
-SANITISED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
+SANITIZED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
 
 
 @cache
@@ -328,9 +328,9 @@ def test_the_sequences_are_of_every_kind() -> None:
 @WHICH
 @pytest.mark.parametrize("activation", ["relu", "tanh"])
 def test_the_host_gives_the_references_bits(which: str, activation: str, source_of: SourceOf, tmp_path: Path) -> None:
-    each = [(SANITISED, drawn(which, activation, MANY if activation == "relu" else FEW))]
+    each = [(SANITIZED, drawn(which, activation, MANY if activation == "relu" else FEW))]
     if (which, activation) == ("both", "relu"):
-        each += [(flags, sequences(which, activation, HOST_STEPS)) for flags in (SANITISED, FIRMWARE)]
+        each += [(flags, sequences(which, activation, HOST_STEPS)) for flags in (SANITIZED, FIRMWARE)]
     for flags, wanted in each:
         found = targets.run_host(source_of(which, activation), tmp_path, flags, wanted.observations)
         assert_same(found, wanted.outputs)

@@ -35,7 +35,7 @@ def fresh(sizes: tuple[int, ...], n: int = 3000) -> np.ndarray:
 @EACH_POLICY
 def test_policy_is_the_formula(sizes: tuple[int, ...], activation: str) -> None:
     policy = policies.policy(sizes, activation)
-    observations = 3.0 * policy.calibration  # far enough for the clip of normalised observations
+    observations = 3.0 * policy.calibration  # far enough for the clip of normalized observations
     np.testing.assert_allclose(full_scales(policy, policy(observations), observations), 0.0, atol=1e-12)
 
 

@@ -4,7 +4,6 @@ Without the cross compiler or QEMU the target's tests are skipped; QRL_REQUIRE_C
 """
 
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from cross_targets import EACH, EITHER, M0, M3, M4F, M7, need
-from qrl.export import baseline, targets
+from qrl.export import targets
 from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, VerificationFailed
 from qrl.export.vectors import Observations, Outputs
 
@@ -346,29 +345,3 @@ def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     assert targets.missing_tools() == ["arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"]
     with pytest.raises(VerificationFailed, match="no C compiler"):
         targets.run_host(tmp_path, tmp_path, RELEASE, GIVEN)
-
-
-def network(rng: np.random.Generator, *widths: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    return [(rng.normal(size=(i, o)) / i**0.5, 0.1 * rng.normal(size=o)) for i, o in pairwise(widths)]
-
-
-@pytest.mark.parametrize("activation", ["tanh", "relu"])
-@EITHER
-def test_the_baselines_are_the_network(core: Core | None, activation: str, tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    layers, obs = network(rng, 18, 24, 16, 4), rng.normal(size=(40, 18))
-    kernel = baseline.write(tmp_path / "kernel", layers, activation, obs)
-    int8 = baseline.naive(layers, activation, obs)
-    obs_i16 = baseline.to_int8(int8, obs)
-    given = Observations(obs, obs_i16)
-    if core is None:
-        run = targets.run_host(kernel, tmp_path, RELEASE, given, baseline.LIBRARIES)
-    else:
-        run, _ = targets.run_core(core, kernel, tmp_path, RELEASE, given, baseline.LIBRARIES)
-    act = obs
-    for weight, bias in layers[:-1]:
-        act = np.tanh(act @ weight + bias) if activation == "tanh" else np.maximum(act @ weight + bias, 0)
-    act = act @ layers[-1][0] + layers[-1][1]
-    np.testing.assert_allclose(run.act, act, atol=2e-6)
-    np.testing.assert_array_equal(run.act_i16, baseline.infer(int8, obs_i16))
-    assert np.abs(run.act_i16 * int8.act_scale - act).mean() < 0.02 * np.abs(act).max()

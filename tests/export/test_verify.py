@@ -25,7 +25,7 @@ from qrl.export.vectors import Observations, Outputs, Vectors
 from qrl.export.verify import compare, verify
 
 MANY, FEW = 10_000, 600
-SANITISED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
+SANITIZED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
 SMALL = [PENDULUM, ODD, FLAT]
 BOTH = pytest.mark.parametrize("activation", ["relu", "tanh"])
 
@@ -91,7 +91,7 @@ HOST_FLAGS = {
     "-O0": ("-std=c99", "-O0"),
     "-O3 fast": ("-std=c99", "-O3", "-ffast-math", "-ffp-contract=fast", "-march=native"),
     "-Os": ("-std=gnu17", "-Os", "-fno-strict-aliasing", "-funsigned-char"),
-    "sanitised": SANITISED,
+    "sanitized": SANITIZED,
     "x87": ("-std=c99", "-O2", "-mfpmath=387"),
     "32 bits, x87": ("-std=c99", "-O2", "-m32", "-mfpmath=387"),
 }
@@ -127,7 +127,7 @@ def test_odd_shapes_give_the_references_bits(
     for activation in ("relu", "tanh"):
         wanted, source = expected(sizes, activation, FEW), kernel_of(sizes, activation)
         if core is None:
-            found = targets.run_host(source, tmp_path, SANITISED, wanted.observations)
+            found = targets.run_host(source, tmp_path, SANITIZED, wanted.observations)
         else:
             found, _ = targets.run_core(core, source, tmp_path, RELEASE, wanted.observations)
         assert_same(found, wanted.outputs)
@@ -198,7 +198,7 @@ def test_the_time_it_takes_hardly_varies(activation: str, core: Core, cases: Cas
 @pytest.mark.parametrize("core", [M0, M4F], ids=["M0", "M4F"], indirect=True)
 @pytest.mark.parametrize("flags", [("-Os",), ("-O0",), FIRMWARE], ids=" ".join)
 @BOTH
-def test_the_assembly_bears_any_optimisation(
+def test_the_assembly_bears_any_optimization(
     activation: str,
     flags: tuple[str, ...],
     core: Core,
@@ -294,12 +294,10 @@ def test_every_target_is_verified_and_measured(kernel_of: KernelOf) -> None:
     report = verify(policies.policy(ODD, "tanh"), policies.kernel(ODD, "tanh"), kernel_of(ODD, "tanh"), 300)
     assert report.passed == ["host, -O2", "host, -O3 -ffast-math", "M0", "M3", "M4F", "M7"]
     assert report.skipped == []
-    assert [cost.core for cost in report.costs] == ["M0", "M3", "M4F", "M7"]
+    assert [cost.core.name for cost in report.costs] == ["M0", "M3", "M4F", "M7"]
     for cost in report.costs:
         assert 100 < cost.step_i16[0] < cost.step[0] <= cost.step[1]
         assert cost.static_ram == 0
-        assert cost.float32
-        assert cost.float32 > cost.step[0]
 
 
 def changed(kernel: Kernel, layer: int, **values: np.ndarray | int) -> Kernel:

@@ -85,20 +85,20 @@ def _specs(sizes: tuple[int, ...]) -> tuple[tuple[ObservationSpec, ...], tuple[A
 def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int = 0, samples: int = 1500) -> Policy:
     """A lively policy of these layer sizes: actions spread over their range, some of them clipped.
 
-    The odd one normalises its observations and clips them, as a run with `normalize_observations` does.
+    The odd one normalizes its observations and clips them, as a run with `normalize_observations` does.
     """
     rng = np.random.default_rng([seed, *sizes])
     flights = {18: hover_flights, 3: pendulum_flights, 5: odd_flights}[sizes[0]](rng, samples)
-    normalised = sizes == ODD
+    normalized = sizes == ODD
     observations, actions = _specs(sizes)
     made = Policy(
         provenance=PROVENANCE,
         control_period_s=0.05 if sizes[0] == 3 else 0.01,
         observations=observations,
         actions=actions,
-        observation_offset=flights.mean(axis=0, dtype=float) if normalised else np.zeros(sizes[0]),
-        observation_gain=1.0 / flights.std(axis=0, dtype=float) if normalised else np.ones(sizes[0]),
-        observation_clip=10.0 if normalised else np.inf,
+        observation_offset=flights.mean(axis=0, dtype=float) if normalized else np.zeros(sizes[0]),
+        observation_gain=1.0 / flights.std(axis=0, dtype=float) if normalized else np.ones(sizes[0]),
+        observation_clip=10.0 if normalized else np.inf,
         observation_scale=rng.uniform(0.25, 1.0, sizes[0]),
         layers=tuple(
             (rng.normal(size=(i, o)) * (2.0 / i) ** 0.5, 0.1 * rng.normal(size=o)) for i, o in pairwise(sizes)

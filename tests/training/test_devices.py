@@ -137,18 +137,18 @@ def test_a_run_has_the_devices_that_it_had(tmp_path: Path) -> None:
         process = fault_injection.start("train", *words, **environment)
         try:
             assert process.stdout
-            return next(line for line in process.stdout if " cpu device" in line)
+            return next(line for line in process.stdout if " CPU device" in line)
         finally:
             process.kill()
             process.communicate()
 
     first, again = tmp_path / "first", tmp_path / "again"
-    assert "on 2 cpu devices" in began("pendulum", *TINY.split(), "--out", first, JAX_NUM_CPU_DEVICES="2")
-    assert "on 1 cpu device " in began("pendulum", *TINY.split(), "--out", tmp_path / "alone")
-    assert "on 2 cpu devices" in began("--config", first / "config.json", "--out", tmp_path / "repeated")
+    assert "on 2 CPU devices" in began("pendulum", *TINY.split(), "--out", first, JAX_NUM_CPU_DEVICES="2")
+    assert "on 1 CPU device " in began("pendulum", *TINY.split(), "--out", tmp_path / "alone")
+    assert "on 2 CPU devices" in began("--config", first / "config.json", "--out", tmp_path / "repeated")
     again.mkdir()
     (again / "config.json").write_bytes((first / "config.json").read_bytes())
-    assert "on 2 cpu devices" in began("pendulum", *TINY.split(), "--out", again, "--resume")
+    assert "on 2 CPU devices" in began("pendulum", *TINY.split(), "--out", again, "--resume")
 
 
 def test_a_seed_of_several_is_repeated_as_it_was_trained() -> None:

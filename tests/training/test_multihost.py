@@ -42,7 +42,7 @@ def both_done(*words: str | Path) -> None:
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One process with two devices."""
-    out = tmp_path_factory.mktemp("peers") / "one"
+    out = tmp_path_factory.mktemp("processes") / "one"
     fault_injection.done(fault_injection.qrl(*TRAIN, "--out", out, **TWO_DEVICES))
     return out
 

@@ -34,7 +34,7 @@ def figure(task: Task, observations: np.ndarray) -> Figure:
         for color, values in zip(COLORS, panel.values, strict=False):
             for line in _turns(values) if panel.scale == "angle" else [values]:
                 axes.plot(times, line, color=color, linewidth=1.4)
-    finish(left, f"the first {len(shown)} of {len(observations):,} flights")
+    finish(left, f"the first {len(shown)} of {len(observations):,} flights" if len(shown) < len(observations) else "")
     finish(upper, successes(found))
     finish(lower)
     legend(figure)
@@ -116,10 +116,9 @@ def _quadrotor_panels(task: QuadrotorTask, shown: np.ndarray, errors: dict[str, 
             logarithmic("distance to circle", "m", distance, spec.distance_m),
             Panel("tangential speed", "m/s", speed, _limits(speed, reward.speed_m_s), reward.speed_m_s, spec.speed_m_s),
         )
-    tilt = np.degrees(np.arccos(np.clip(shown[:, :, 8], -1.0, 1.0)))
     return (
         logarithmic("distance to target", "m", few["position_m"], spec.distance_m),
-        Panel("tilt", "°", tilt, (0.0, 180.0)),
+        Panel("tilt", "°", measures.tilt_deg(shown), (0.0, 180.0)),
     )
 
 
@@ -132,8 +131,9 @@ def _pendulum_panels(task: PendulumTask, shown: np.ndarray) -> tuple[Panel, Pane
 
 
 def _limits(speed: np.ndarray, target: float) -> tuple[float, float]:
-    """Axis limits that show `speed` between −1 and 3 times the target."""
-    finite = np.isfinite(speed)
-    low = np.min(speed, initial=0.5 * target, where=finite)
-    high = np.max(speed, initial=1.5 * target, where=finite)
-    return max(low - 0.1 * target, -target), min(high + 0.1 * target, 3.0 * target)
+    """Axis limits that show `speed` between −1 and 3 times the target, which is negative for a clockwise circle."""
+    finite, size = np.isfinite(speed), abs(target)
+    low = np.min(speed, initial=target - 0.5 * size, where=finite)
+    high = np.max(speed, initial=target + 0.5 * size, where=finite)
+    lowest, highest = sorted((-target, 3.0 * target))
+    return max(low - 0.1 * size, lowest), min(high + 0.1 * size, highest)

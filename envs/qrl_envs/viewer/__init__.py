@@ -139,9 +139,8 @@ def _in_units(task: Task, actions: np.ndarray) -> np.ndarray:
 def _start(task: Task, observation: np.ndarray) -> str:
     if isinstance(task, PendulumTask):
         return f"{np.degrees(np.arctan2(observation[1], observation[0])):.0f}°, {observation[2]:.1f} rad/s"
-    tilt = np.degrees(np.arccos(np.clip(observation[8], -1.0, 1.0)))
-    away, speed = np.linalg.norm(observation[9:12]), np.linalg.norm(observation[12:15])
-    return f"tilt {tilt:.0f}°, {away:.1f} m away, {speed:.1f} m/s"
+    tilt, speed = measures.tilt_deg(observation), measures.speed_m_s(observation)
+    return f"tilt {tilt:.0f}°, {np.linalg.norm(observation[9:12]):.1f} m away, {speed:.1f} m/s"
 
 
 def _outcome(found: Measured, i: int, end_s: float) -> str:
@@ -200,10 +199,9 @@ def _quadrotor_panels(
         target, distance = "circle", np.hypot(error["radius_m"], error["height_m"])
         label, speed = "tangential speed", error["speed_m_s"] + wanted.speed_m_s
         band = wanted.speed_m_s - spec.speed_m_s, wanted.speed_m_s + spec.speed_m_s
-        limits = (
-            max(-wanted.speed_m_s, _least(speed)),
-            min(3.0 * wanted.speed_m_s, _most(speed, 1.5 * wanted.speed_m_s)),
-        )
+        lowest, highest = sorted((-wanted.speed_m_s, 3.0 * wanted.speed_m_s))
+        beyond = 1.5 * wanted.speed_m_s  # below 0 for a clockwise circle
+        limits = max(lowest, _least(speed, min(0.0, beyond))), min(highest, _most(speed, max(0.0, beyond)))
     else:
         target, distance, band = "target", error["position_m"], None
         label, speed = "speed", np.linalg.norm(observations[..., 12:15], axis=-1)
@@ -254,8 +252,8 @@ def _in_pi(turns: int) -> str:
     return {0: "0", 1: "π", -1: "−π"}.get(turns, f"{turns}π".replace("-", "−"))
 
 
-def _least(values: np.ndarray) -> float:
-    return float(np.min(values, initial=0.0, where=np.isfinite(values)))
+def _least(values: np.ndarray, initial: float = 0.0) -> float:
+    return float(np.min(values, initial=initial, where=np.isfinite(values)))
 
 
 def _most(values: np.ndarray, initial: float = 0.0) -> float:

@@ -28,7 +28,7 @@ const polygon = (x, y, radius, n) =>
     return [x + radius * Math.cos(angle), y + radius * Math.sin(angle)];
   });
 
-function strip(x, y, halfWidth) { // from the body's centre to x, y
+function strip(x, y, halfWidth) { // from the body's center to x, y
   const length = Math.hypot(x, y) || 1, u = -y / length * halfWidth, v = x / length * halfWidth;
   return [[u, v], [-u, -v], [x - u, y - v], [x + u, y + v]];
 }

@@ -17,12 +17,12 @@ from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
-from qrl.export import baseline, emit, vectors
+from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import Ints, Kernel
 from qrl.export.policy import Policy
-from qrl.export.quantize import UnsupportedNetwork, quantize, respond, si_layers
+from qrl.export.quantize import UnsupportedNetwork, quantize, respond
 from qrl.export.report import FlightStats, Measured, gates, report
 from qrl.export.verify import VerificationReport, verify
 from qrl_envs.specfile import BadInput
@@ -47,7 +47,7 @@ def export(args: argparse.Namespace) -> int:
     for cost in verification.costs:
         mean, mean_i16 = cost.step[0], cost.step_i16[0]
         memory = f"{cost.flash:>6,} B {max(cost.stack):>5} B {cost.state:>4} B"
-        console.print(f"{cost.core:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {memory}")
+        console.print(f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {memory}")
     duration = clock(time.perf_counter() - start_time)
     console.print(f"done in {duration}: {run.folder / 'export'}/{name}.c, .h, report.md")
     return DONE
@@ -118,12 +118,6 @@ def _measured(
         return after, action
 
     measured = len(policy.observations)
-    network = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
-
-    def naive(inputs: NDArray[np.float32]) -> NDArray[np.floating]:
-        outputs = baseline.infer(network, baseline.to_int8(network, inputs))
-        return np.clip(outputs * network.act_scale, *policy.limits)
-
     keys = evaluation_starts(starts)
     float_flights = run.fly(keys)
     integer_flights = run.fly_host_policy(integer, reference.initial_state(kernel, starts), keys)
@@ -136,7 +130,6 @@ def _measured(
     tail = run.tail_steps()
     return Measured(
         accuracy=accuracy(policy, partial(respond, kernel), flown),
-        naive=accuracy(policy, naive, calibration.subsample(flown, calibration.SAMPLES)),
         float_flights=_stats(policy, float_flights, tail),
         integer_flights=_stats(policy, integer_flights, tail),
         verification=verification(),

@@ -8,7 +8,7 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
@@ -31,12 +31,13 @@ class _Parser(argparse.ArgumentParser):
         print_error(message)
         sys.exit(WRONG_INPUT)
 
-    def refuse(self, word: str) -> NoReturn:
-        flags = [flag for action in self._actions for flag in action.option_strings]
+    def refuse(self, word: str, former: Mapping[str, str]) -> NoReturn:
+        """Exit with the flag that `word` is nearest to; where that is a `former` one, with its current name."""
+        flags = {flag: flag for action in self._actions for flag in action.option_strings} | former
         close = difflib.get_close_matches(word.split("=")[0], flags, n=1) if word.startswith("-") else []
         self.error(
             f"unknown {'flag' if word.startswith('-') else 'argument'} {word}"
-            f" ({f'did you mean {close[0]}?' if close else f'see {self.prog} --help'})"
+            f" ({f'did you mean {flags[close[0]]}?' if close else f'see {self.prog} --help'})"
         )
 
 
@@ -157,7 +158,7 @@ def _parse(argv: list[str] | None) -> argparse.Namespace:
     args, unknown = parser.parse_known_args(words)
     if unknown:
         commands = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-        commands.choices[args.command].refuse(unknown[0])
+        commands.choices[args.command].refuse(unknown[0], former)
     return args
 
 

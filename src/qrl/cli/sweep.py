@@ -11,7 +11,7 @@ from typing import Any
 import jax
 
 from qrl import tasks
-from qrl.cli.terminal import DONE, FAILED, clock, console, print_error, progress_bar, stop_requested
+from qrl.cli.terminal import DONE, FAILED, clock, console, plural, print_error, progress_bar, stop_requested
 from qrl.runs import files, record
 from qrl.sweep import grid as grids
 from qrl.sweep import plot, results, runner
@@ -47,9 +47,9 @@ def sweep(args: argparse.Namespace) -> int:
             files.write_json(out / "grid.json", {**grid.record, **here})
         total = len(grid.points) * len(grid.seeds)
         console.print(
-            f"{len(grid.points):,} points × {len(grid.seeds)} seeds = {total:,} members in {len(groups)} compiled"
-            f" program{'s' * (len(groups) > 1)}, {len(devices.workers())} workers on {jax.local_devices()[0].platform}"
-            f" -> {out}"
+            f"{plural(len(grid.points), 'point')} × {plural(len(grid.seeds), 'seed')} = {plural(total, 'member')} in"
+            f" {plural(len(groups), 'compiled program')}, {plural(len(devices.workers()), 'worker')} on"
+            f" {jax.local_devices()[0].platform.upper()} -> {out}"
         )
         with stop_requested("stopping: finished chunks are kept") as stopped:
             _train_groups(groups, out, budget, stopped)
@@ -73,7 +73,7 @@ def _holds_sweep(out: Path, grid: Grid) -> bool:
         return False
     stored = {key: value for key, value in read(path).items() if key not in ("versions", "devices")}
     if stored != json.loads(json.dumps(grid.record)):
-        raise BadInput(f"{out}: holds a sweep of another grid ({path}); give another OUT")
+        raise BadInput(f"{out}: holds a sweep of another grid, or by another version of qrl ({path}); give another OUT")
     return True
 
 

@@ -48,6 +48,10 @@ def stop_requested(message: str = "stopping: saving first") -> Iterator[Callable
             signal.signal(number, handler)
 
 
+def plural(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'s' * (count != 1)}"
+
+
 def clock(seconds: float) -> str:
     minutes, seconds = divmod(round(seconds), 60)
     return f"{minutes}:{seconds:02d}"

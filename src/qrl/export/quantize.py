@@ -221,7 +221,7 @@ def _check(policy: Policy) -> None:
 
 
 def si_layers(policy: Policy) -> list[Layer]:
-    """Layers with observations and actions in SI units: normalisation, offset and action scale folded in."""
+    """Layers with observations and actions in SI units: normalization, offset and action scale folded in."""
     layers = [(weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in policy.layers]
     weight, bias = layers[0]
     weight = weight * (policy.observation_gain * policy.observation_scale)[:, None]
@@ -305,13 +305,13 @@ def _row(
     share = sensitivity / max(sensitivity.mean(), 1e-30) + MIN_SENSITIVITY
     share /= share.sum()
     mean = share @ x
-    centred = x - mean
-    weighted = centred * share[:, None]
-    second = weighted.T @ centred
+    centered = x - mean
+    weighted = centered * share[:, None]
+    second = weighted.T @ centered
     diagonal = np.diag(second)
     second += np.diag(ridge * diagonal + 1e-5 * diagonal.mean() + 1e-12)
     middle = share @ target
-    fitted = weight + np.linalg.solve(second, weighted.T @ (target - middle - centred @ weight))
+    fitted = weight + np.linalg.solve(second, weighted.T @ (target - middle - centered @ weight))
     finest = max(float(np.abs(fitted).max()) / INT8, floor)
     integers = _rounded(fitted / (finest * UNITS[:, None]), second)
     error = integers * (finest * UNITS[:, None]) - fitted

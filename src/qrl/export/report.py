@@ -35,13 +35,12 @@ class Gate:
         return f"{value:.3g} {self.unit}".strip()
 
     def __str__(self) -> str:
-        return f"{self.name} {self.with_unit(self.measured)} (limit {self.with_unit(self.limit)})"
+        return f"{self.name}: {self.with_unit(self.measured)} (limit {self.with_unit(self.limit)})"
 
 
 @dataclass(frozen=True)
 class Measured:
     accuracy: Accuracy
-    naive: Accuracy
     float_flights: FlightStats
     integer_flights: FlightStats
     verification: VerificationReport
@@ -59,7 +58,7 @@ def gates(measured: Measured) -> list[Gate]:
     ]
     if before.success is not None and after.success is not None:
         lost, gained = int(np.sum(before.success & ~after.success)), int(np.sum(after.success & ~before.success))
-        found.append(Gate(f"successful starts lost of {before.starts:,} ({gained} gained):", lost, 0))
+        found.append(Gate(f"successful starts lost (of {before.starts:,}; {gained} gained)", lost, 0))
     for name, value in before.summary.items():
         if name.startswith("rms_") and name.endswith("_m"):
             label = name.removeprefix("rms_").removesuffix("_m")
@@ -125,14 +124,7 @@ def _accuracy(measured: Measured, found: list[Gate]) -> Iterable[str]:
         if np.isfinite(value) or np.isfinite(after.summary[name]):
             yield f"| {name} | {value:.5g} | {after.summary[name]:.5g} |"
     yield f"| jitter, full scales per step | {before.jitter:.5f} | {after.jitter:.5f} |"
-    yield (
-        f"\nFor comparison, a naive int8 network (one scale per tensor, int8 activations) has an RMS action error of"
-        f" {measured.naive.rmse:.2%} and a maximum of {measured.naive.maximum:.1%} on a sample of the same flights.\n"
-    )
-
-
-CLOCKS = {"M0": 48, "M3": 72, "M4F": 168, "M7": 480}  # MHz of a common chip with that core
-CYCLES_PER_INSTRUCTION = {"M0": 1.5, "M3": 1.5, "M4F": 1.3, "M7": 1.0}
+    yield ""
 
 
 def _costs(policy: Policy, measured: Measured, name: str) -> Iterable[str]:
@@ -142,16 +134,15 @@ def _costs(policy: Policy, measured: Measured, name: str) -> Iterable[str]:
         yield "Not measured: this needs the Arm compiler and QEMU (above).\n"
         return
     yield "Instructions per inference under QEMU: mean of inputs in range (maximum over all vectors).\n"
-    yield f"| core | `{name}_step` | `{name}_step_i16` | plain float32 | naive int8 |\n|---|---|---|---|---|"
+    yield f"| core | `{name}_step` | `{name}_step_i16` |\n|---|---|---|"
     for cost in costs:
         both = (f"{mean:,.0f} ({most:,.0f})" for mean, most in (cost.step, cost.step_i16))
-        others = ("–" if x is None else f"{x:,.0f}" for x in (cost.float32, cost.naive_int8))
-        yield f"| {cost.core} | {' | '.join([*both, *others])} |"
+        yield f"| {cost.core.name} | {' | '.join(both)} |"
     yield "\n| core | flash | state | static RAM | stack: float entry | i16 entry | self-test | compiler library |"
     yield "|---|---|---|---|---|---|---|---|"
     for cost in costs:
         sizes = cost.flash, cost.state, cost.static_ram, *cost.stack, cost.library
-        yield f"| {cost.core} | {' | '.join(f'{size:,} B' for size in sizes)} |"
+        yield f"| {cost.core.name} | {' | '.join(f'{size:,} B' for size in sizes)} |"
     yield "\nFlash: text and data of the one object, -O2, all entry points and the self-test with its vectors.\n"
     yield (
         "Estimated rates: QEMU counts instructions, not cycles, so the cycles per instruction are assumed. Flash wait"
@@ -160,9 +151,10 @@ def _costs(policy: Policy, measured: Measured, name: str) -> Iterable[str]:
     )
     yield "| core | clock | assumed cycles per instruction | float entry | i16 entry |\n|---|---|---|---|---|"
     for cost in costs:
-        per_second = CLOCKS[cost.core] * 1e6 / CYCLES_PER_INSTRUCTION[cost.core]
+        core = cost.core
+        per_second = core.clock_MHz * 1e6 / core.cycles_per_instruction
         rates = " | ".join(f"{per_second / most:,.0f} Hz" for _, most in (cost.step, cost.step_i16))
-        yield f"| {cost.core} | {CLOCKS[cost.core]} MHz | {CYCLES_PER_INSTRUCTION[cost.core]} | {rates} |"
+        yield f"| {core.name} | {core.clock_MHz} MHz | {core.cycles_per_instruction} | {rates} |"
     yield f"\nThe policy needs {1 / policy.control_period_s:,.0f} Hz.\n"
 
 

@@ -44,23 +44,25 @@ typedef {name}_state kernel_state;
 
 
 class Core(NamedTuple):
-    """A QEMU machine; `tick`: instructions per tick of its SysTick under `-icount shift=0`."""
+    """A QEMU machine, and what is assumed of a common chip with that core."""
 
     name: str
     machine: str
     flags: tuple[str, ...]
-    tick: float
+    tick: float  # instructions per tick of its SysTick under `-icount shift=0`
     flash_bytes: int
     ram_bytes: int
+    clock_MHz: int
+    cycles_per_instruction: float
 
 
 _KIB, _MIB = 1 << 10, 1 << 20
 _HARD = ("-mfloat-abi=hard", "-mthumb")
 CORES = (
-    Core("M0", "microbit", ("-mcpu=cortex-m0", "-mthumb"), 62.5, 256 * _KIB, 16 * _KIB),
-    Core("M3", "mps2-an385", ("-mcpu=cortex-m3", "-mthumb"), 40.0, 4 * _MIB, 4 * _MIB),
-    Core("M4F", "mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB),
-    Core("M7", "mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB),
+    Core("M0", "microbit", ("-mcpu=cortex-m0", "-mthumb"), 62.5, 256 * _KIB, 16 * _KIB, 48, 1.5),
+    Core("M3", "mps2-an385", ("-mcpu=cortex-m3", "-mthumb"), 40.0, 4 * _MIB, 4 * _MIB, 72, 1.5),
+    Core("M4F", "mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB, 168, 1.3),
+    Core("M7", "mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB, 480, 1.0),
 )
 
 

@@ -8,14 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qrl.export import baseline, targets, vectors
+from qrl.export import targets, vectors
 from qrl.export.kernel import Kernel
 from qrl.export.policy import Policy
-from qrl.export.quantize import si_layers
-from qrl.export.targets import CORES, FIRMWARE, STRICT, Core, Counts, VerificationFailed
-from qrl.export.vectors import Observations, Outputs, Vectors
+from qrl.export.targets import CORES, FIRMWARE, STRICT, Core, VerificationFailed
+from qrl.export.vectors import Outputs, Vectors
 
-BASELINE_VECTORS = 20
 SEQUENCES = 2
 HOST_STEPS, CORE_STEPS = 6_000, 600  # of each sequence
 
@@ -23,11 +21,9 @@ HOST_STEPS, CORE_STEPS = 6_000, 600  # of each sequence
 class Cost(NamedTuple):
     """Cost on one core; `step`, `step_i16`: instructions per inference, mean of inputs in range, maximum of all."""
 
-    core: str
+    core: Core
     step: tuple[float, float]
     step_i16: tuple[float, float]
-    float32: float | None  # instructions of the same network in plain float32; None if it does not fit the core
-    naive_int8: float | None  # and in naive int8
     state: int  # bytes of NAME_state
     flash: int  # bytes of text and data of the one object, -O2, all entry points
     static_ram: int  # bytes
@@ -66,10 +62,8 @@ def verify(policy: Policy, kernel: Kernel, source: Path, n: int) -> Verification
         if missing := targets.missing_tools():
             skipped.append(f"Cortex-M and its costs: {', '.join(missing)} not found")
         else:
-            plain = Path(work) / "baseline"
-            plain = baseline.write(plain, si_layers(policy), policy.activation, policy.calibration)
             for core in CORES:
-                jobs.append((core.name, pool.submit(_on_core, core, source, Path(work), policy, on_core, plain)))
+                jobs.append((core.name, pool.submit(_on_core, core, source, Path(work), on_core)))
         for name, job in jobs:
             cost = job.result()
             passed.append(name)
@@ -82,38 +76,24 @@ def _on_host(source: Path, work: Path, flags: tuple[str, ...], expected: list[Ve
         compare(name, targets.run_host(source, work, flags, each.observations), each.outputs)
 
 
-def _on_core(core: Core, source: Path, work: Path, policy: Policy, expected: list[Vectors], plain: Path) -> Cost:
+def _on_core(core: Core, source: Path, work: Path, expected: list[Vectors]) -> Cost:
     first, *rest = expected
     outputs, counts = targets.run_core(core, source, work, targets.RELEASE, first.observations)
     compare(core.name, outputs, first.outputs)
     for each in rest:
         compare(core.name, targets.run_core(core, source, work, targets.RELEASE, each.observations)[0], each.outputs)
     size = targets.size(core, source, work)
-    obs = policy.calibration[:: max(1, len(policy.calibration) // BASELINE_VECTORS)][:BASELINE_VECTORS]
-    naive = _baseline_counts(core, plain, work, policy, obs)
     f32, i16 = counts.f32[first.outputs.status == 0], counts.i16[first.outputs.status_i16 == 0]
     return Cost(
-        core=core.name,
+        core=core,
         step=(float(f32.mean()), float(counts.f32.max())),
         step_i16=(float(i16.mean()), float(counts.i16.max())),
-        float32=naive and float(naive.f32.mean()),
-        naive_int8=naive and float(naive.i16.mean()),
         state=outputs.state.shape[1],
         flash=size.text + size.data,
         static_ram=size.data + size.bss,
         stack=(counts.stack_f32, counts.stack_i16, counts.stack_selftest),
         library=size.library,
     )
-
-
-def _baseline_counts(core: Core, plain: Path, work: Path, policy: Policy, obs: np.ndarray) -> Counts | None:
-    """Costs of the same network written plainly; None if it does not fit the core."""
-    network = baseline.naive(si_layers(policy), policy.activation, policy.calibration)
-    given = Observations(obs, baseline.to_int8(network, obs))
-    try:
-        return targets.run_core(core, plain, work, ("-std=c99", "-O2"), given, baseline.LIBRARIES)[1]
-    except VerificationFailed:
-        return None
 
 
 def compare(target: str, found: Outputs, expected: Outputs) -> None:

@@ -79,7 +79,7 @@ class GridPoint:
 
 @dataclass(frozen=True)
 class Grid:
-    """A whole sweep: every point is trained with every seed."""
+    """A sweep: every point is trained with every seed."""
 
     file: GridFile
     points: list[GridPoint]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from qrl.runs.learning_curve import BLUE, GREEN, INK, empty_figure, plain_style
 
 LOG_ABOVE = 20.0  # ratio of the greatest to the least value from which an axis is logarithmic
-LABELLED = 120  # cells of a heat map that still have room for their numbers
+LABELED = 120  # cells of a heat map that still have room for their numbers
 COLORS = {"return_mean": BLUE, "success": GREEN}
 NAMES = {"return_mean": "return", "success": "success"}
 Summary = dict[str, Any]  # {"at": {axis: value}, metric: {"median", "q1", "q3"}}
@@ -89,7 +89,7 @@ def _heat_map(axes: Axes, found: Sequence[Summary], names: list[str], metric: st
     axes.set_xticks(range(len(across)), across, parse_math=False)
     axes.set_ylabel(names[0], parse_math=False)
     axes.set_xlabel(names[1], parse_math=False)
-    if cells.size <= LABELLED:
+    if cells.size <= LABELED:
         for (i, j), value in np.ndenumerate(cells):
             light = np.asarray(image.norm(np.array([value]))).item() > 0.6  # of viridis' two ends
             color = INK if light else "white"

@@ -101,7 +101,7 @@ def _num_used(run: RunConfig) -> int:
 def describe_devices(run: RunConfig) -> str:
     count, available = _num_used(run), jax.device_count()
     of = f" of {available}" if count < available else ""
-    return f"{count}{of} {jax.default_backend()} device{'s' * (count > 1 or bool(of))}"
+    return f"{count}{of} {jax.default_backend().upper()} device{'s' * (count > 1 or bool(of))}"
 
 
 def check_devices(run: RunConfig) -> None:

@@ -1,14 +1,31 @@
-"""The same network in plain float32 and in naive int8: baselines for the kernel's costs and errors."""
+"""What the kernel is compared with: its network in plain float32 and in naive int8 (one scale per tensor).
+
+    .venv/bin/python -m experiments.kernel.plain RUN
+
+Prints the action error of naive int8 on the calibration of the run's policy, and, where the Arm compiler and QEMU are
+installed, the instructions per inference of both on each core. `make export RUN=…` prints those of the kernel.
+"""
 
 import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
 import numpy as np
 
-from qrl.export.targets import SOURCES, Floats, Ints
+from experiments.arguments import Parser, run_main
+from qrl.evaluation.trained_run import TrainedRun
+from qrl.export import targets
+from qrl.export.accuracy import accuracy
+from qrl.export.quantize import si_layers
+from qrl.export.targets import CORES, Floats, Ints, VerificationFailed
+from qrl.export.vectors import Observations
+from qrl_envs.specfile import BadInput
 
+SOURCES = Path(__file__).parent
+COST_OBSERVATIONS = 20
+FLAGS = ("-std=c99", "-O2")
 Layers = Sequence[tuple[Floats, Floats]]  # weight [in, out] and bias [out] of each, the last without activation
 LIBRARIES = ("-lm",)
 _ACTIVATIONS = {"tanh": (np.tanh, "tanhf(x)"), "relu": (lambda x: np.maximum(x, 0), "((x) > 0.0f ? (x) : 0.0f)")}
@@ -74,7 +91,7 @@ def _int8(values: Floats, scale: float) -> Ints:
 
 
 def data(layers: Layers, activation: str, obs: Floats) -> str:
-    """baseline_data.h: the weights for harness/baseline.c."""
+    """plain_data.h: the weights for plain.c."""
     network, parts, rows = naive(layers, activation, obs), list[str](), list[str]()
     for i, ((weight, bias), int8) in enumerate(zip(layers, network.layers, strict=True)):
         inputs, outputs = weight.shape
@@ -107,8 +124,45 @@ def write(folder: Path, layers: Layers, activation: str, obs: Floats) -> Path:
     """A kernel in `folder` for `run_core(..., libraries=LIBRARIES)`; its int16 entry is the naive int8 network."""
     folder.mkdir(parents=True, exist_ok=True)
     inputs, outputs = layers[0][0].shape[0], layers[-1][0].shape[1]
-    header = (SOURCES / "baseline.h").read_text(encoding="utf-8")
-    sizes = f"#define BASELINE_OBS_SIZE {inputs}\n#define BASELINE_ACT_SIZE {outputs}\n"
-    (folder / "baseline.h").write_text(sizes + header, encoding="utf-8")
-    (folder / "baseline_data.h").write_text(data(layers, activation, obs), encoding="utf-8")
-    return Path(shutil.copy(SOURCES / "baseline.c", folder))
+    header = (SOURCES / "plain.h").read_text(encoding="utf-8")
+    sizes = f"#define PLAIN_OBS_SIZE {inputs}\n#define PLAIN_ACT_SIZE {outputs}\n"
+    (folder / "plain.h").write_text(sizes + header, encoding="utf-8")
+    (folder / "plain_data.h").write_text(data(layers, activation, obs), encoding="utf-8")
+    return Path(shutil.copy(SOURCES / "plain.c", folder))
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = Parser("plain", __doc__)
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    try:
+        policy = TrainedRun.load(parser.parse_args(argv).run).policy()
+    except BadInput as error:
+        parser.error(str(error))
+    layers, sample = si_layers(policy), policy.calibration
+    network = naive(layers, policy.activation, sample)
+
+    def flown(obs: Floats) -> Floats:
+        return np.clip(infer(network, to_int8(network, obs)) * network.act_scale, *policy.limits)
+
+    error = accuracy(policy, flown, sample)
+    print(f"naive int8: RMS action error {error.rmse:.2%}, maximum {error.maximum:.1%} of full scale")
+    if missing := targets.missing_tools():
+        print(f"no costs: {', '.join(missing)} not found")
+        return 0
+    obs = sample[:: max(1, len(sample) // COST_OBSERVATIONS)][:COST_OBSERVATIONS]
+    print(f"{'instructions per inference':<27} {'plain float32':>14} {'naive int8':>11}")
+    with TemporaryDirectory() as scratch:
+        work = Path(scratch)
+        kernel = write(work / "plain", layers, policy.activation, sample)
+        given = Observations(obs, to_int8(network, obs))
+        for core in CORES:
+            try:
+                _, counts = targets.run_core(core, kernel, work, FLAGS, given, LIBRARIES)
+                print(f"{core.name:<27} {counts.f32.mean():>14,.0f} {counts.i16.mean():>11,.0f}")
+            except VerificationFailed as failure:
+                print(f"{core.name:<27} {failure}")
+    return 0
+
+
+if __name__ == "__main__":
+    run_main("plain", main)

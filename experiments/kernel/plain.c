@@ -1,7 +1,7 @@
-/* The same network in plain C with the kernel's interface, as a baseline for costs:
-   baseline_step is float32 with the C library's tanhf; baseline_step_i16 is int8 with one scale per tensor,
+/* The same network in plain C with the kernel's interface, as a plain for costs:
+   plain_step is float32 with the C library's tanhf; plain_step_i16 is int8 with one scale per tensor,
    and its int16 arguments hold int8 values. Without memory: that of a policy is among the observations. */
-#include "baseline.h"
+#include "plain.h"
 
 #include <math.h>
 
@@ -15,11 +15,11 @@ struct layer {
     const int8_t *table; /* of the activation, 256 entries; null for the last layer */
 };
 
-#include "baseline_data.h"
+#include "plain_data.h"
 
-void baseline_reset(baseline_state *state) { state->unused = 0; }
+void plain_reset(plain_state *state) { state->unused = 0; }
 
-int baseline_step(baseline_state *state, const float obs[BASELINE_OBS_SIZE], float act[BASELINE_ACT_SIZE])
+int plain_step(plain_state *state, const float obs[PLAIN_OBS_SIZE], float act[PLAIN_ACT_SIZE])
 {
     (void)state;
     float values[2][WIDEST];
@@ -39,11 +39,11 @@ int baseline_step(baseline_state *state, const float obs[BASELINE_OBS_SIZE], flo
     return 0;
 }
 
-int baseline_step_i16(baseline_state *state, const int16_t obs[BASELINE_OBS_SIZE], int16_t act[BASELINE_ACT_SIZE])
+int plain_step_i16(plain_state *state, const int16_t obs[PLAIN_OBS_SIZE], int16_t act[PLAIN_ACT_SIZE])
 {
     (void)state;
     int8_t values[2][WIDEST];
-    for (int i = 0; i < BASELINE_OBS_SIZE; i++) {
+    for (int i = 0; i < PLAIN_OBS_SIZE; i++) {
         values[0][i] = (int8_t)obs[i];
     }
     for (int l = 0; l < LAYERS; l++) {
@@ -60,10 +60,10 @@ int baseline_step_i16(baseline_state *state, const int16_t obs[BASELINE_OBS_SIZE
             y[o] = layer->table ? layer->table[y8 + 128] : (int8_t)y8;
         }
     }
-    for (int o = 0; o < BASELINE_ACT_SIZE; o++) {
+    for (int o = 0; o < PLAIN_ACT_SIZE; o++) {
         act[o] = values[LAYERS % 2][o];
     }
     return 0;
 }
 
-int baseline_selftest(void) { return 0; }
+int plain_selftest(void) { return 0; }
