@@ -4,6 +4,7 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from brax.envs.fast import Fast
 
@@ -11,8 +12,10 @@ import policies
 from cli_helpers import TINY, complaint, qrl
 from qrl.cli import export
 from qrl.evaluation import calibration
+from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
 from qrl.export import targets
 from qrl.export.kernel import AccumulatorOverflow
+from qrl.export.policy import Memory
 from qrl.export.quantize import UnsupportedNetwork
 from qrl.export.targets import VerificationFailed
 
@@ -132,6 +135,23 @@ def test_a_foreign_environment_exports(
     assert set(contents(run / "export")) == policies.emitted_files("qrl_fast") | {"report.md"}
 
 
+def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
+    """As if the last observation of the pendulum were the previous action a: the policy has it in N m."""
+    loaded = TrainedRun.load(run)
+    observations, actions = loaded._specs()
+    loaded._specs = lambda: (observations[:2], actions)
+    policy = loaded.float_policy(Memory(previous_action=True, integral=None))
+    seen = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)).astype(np.float32)
+    inputs = inputs_in_si(policy, seen)
+    np.testing.assert_allclose(inputs, seen * [1.0, 1.0, 2.0])  # the greatest torque is 2 N m
+    wanted = 2.0 * np.clip(np.asarray(loaded.policy_mean(seen)), -1.0, 1.0)
+    assert np.ptp(wanted) > 1e-3
+    np.testing.assert_allclose(policy(inputs), wanted, atol=1e-5)
+    memory, action = policy.step(inputs[:, 2:], inputs[:, :2])
+    np.testing.assert_allclose(action, wanted, atol=1e-5)
+    np.testing.assert_array_equal(memory, action)
+
+
 # -- refused -------------------------------------------------------------------------------------------------
 
 
@@ -193,6 +213,24 @@ def test_a_network_without_a_form_is_refused(
     monkeypatch.setattr(export, "quantize", fail)
     assert complaint(capsys, "export", run, *LEAST) == f"qrl: {run}: layer 1: a weight is not finite\n"
     assert not (run / "export").exists()
+
+
+@pytest.mark.parametrize("name", ["9lives", "my-policy", "", "a b", "stdint", "../x", "é", "x" * 65])
+def test_a_name_that_c_cannot_have_is_refused(name: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = complaint(capsys, "export", run, *LEAST, "--name", name)
+    assert line.startswith(f"qrl: --name '{name}': expected a C identifier")
+    assert not (run / "export").exists()
+
+
+def test_an_export_has_the_name_that_is_given(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And an export of another name replaces it whole."""
+    assert qrl("export", run, *LEAST) == 0
+    assert qrl("export", run, *LEAST, "--name", "swing_up") == 0
+    assert f"{run}/export/swing_up.c" in capsys.readouterr().out
+    assert set(contents(run / "export")) == policies.emitted_files("swing_up") | {"report.md"}
+    manifest = json.loads((run / "export" / "manifest.json").read_text())
+    assert (manifest["format"], manifest["name"], manifest["state_bytes"]) == (2, "swing_up", 1)
+    assert (manifest["vehicle"], manifest["memory"]) == (None, None)
 
 
 @pytest.mark.parametrize("flag", ["--starts", "--vectors"])

@@ -119,10 +119,16 @@ def golden(policy: Policy, kernel: Kernel, n: int = 256) -> Vectors:
     first = embedded(kernel)
     obs = observations(policy, kernel, 2 * n)
     obs = obs[np.isfinite(obs).all(axis=1)]
-    if policy.memory and (integral := policy.memory.integral):  # first of all, where the integral moves
-        distance = np.linalg.norm(obs[: n // 2, list(integral.position)].astype(np.float64), axis=1)
-        obs[: n // 2] = obs[np.argsort(np.abs(distance / integral.radius_m - 0.5), kind="stable")]
-    clipped = int(np.argmax(reference.step(kernel, reference.initial_state(kernel, len(obs)), obs)[1]))
+    _, status, act = reference.step(kernel, reference.initial_state(kernel, len(obs)), obs)
+    if kernel.memory:  # first of all, where it shows: no action at a limit, and the integral moves
+        at_limit = np.isin(act[: n // 2] / kernel.act_lsb, [kernel.act_min, kernel.act_max]).sum(axis=1)
+        moves = np.zeros(n // 2)
+        if policy.memory and (integral := policy.memory.integral):
+            distance = np.linalg.norm(obs[: n // 2, list(integral.position)].astype(np.float64), axis=1)
+            moves = (distance < 0.8 * integral.radius_m) & (distance > 0.0)
+        order = np.lexsort((at_limit, ~moves.astype(bool)))
+        obs[: n // 2], status[: n // 2] = obs[order], status[order]
+    clipped = int(np.argmax(status))
     order = [*range(first - 1), clipped, *(i for i in range(first - 1, len(obs)) if i != clipped)]
     obs = obs[[*order[:first], *order[first :: max(1, (len(order) - first) // (n - first))]][:n]]
     obs_i16 = np.clip(reference.quantized(kernel, obs)[0], -INT16, INT16).astype(np.int16)
