@@ -10,14 +10,17 @@ from brax.envs.fast import Fast
 
 import policies
 from cli_helpers import TINY, complaint, qrl
+from qrl import tasks
 from qrl.cli import export
 from qrl.evaluation import calibration
-from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
+from qrl.evaluation.trained_run import TrainedRun, inputs_in_si, vehicle_name
 from qrl.export import targets
 from qrl.export.kernel import AccumulatorOverflow
 from qrl.export.policy import Memory
 from qrl.export.quantize import UnsupportedNetwork
 from qrl.export.targets import VerificationFailed
+from qrl_envs.task import QuadrotorTask
+from qrl_envs.vehicle import shipped_vehicles
 
 LEAST = ("--starts", "8", "--vectors", "500")
 FILES = policies.emitted_files("qrl_pendulum") | {"report.md"}
@@ -150,6 +153,18 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
     memory, action = policy.step(inputs[:, 2:], inputs[:, :2])
     np.testing.assert_allclose(action, wanted, atol=1e-5)
     np.testing.assert_array_equal(memory, action)
+
+
+@pytest.mark.parametrize("name", shipped_vehicles())
+def test_a_shipped_vehicle_is_named(name: str) -> None:
+    """As the task that a run records has it, under whatever name that is."""
+    task = tasks.spec(tasks.task_record("hover", name))
+    assert isinstance(task, QuadrotorTask)
+    assert vehicle_name(task) == name
+    heavier = task.model_copy(
+        update={"vehicle": task.vehicle.model_copy(update={"mass_kg": 1.01 * task.vehicle.mass_kg})}
+    )
+    assert vehicle_name(heavier) is None
 
 
 # -- refused -------------------------------------------------------------------------------------------------

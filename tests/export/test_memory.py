@@ -18,7 +18,7 @@ from policies import HOVER, ODD, REMEMBERING
 from qrl.export import emit, targets, vectors
 from qrl.export import kernel as reference
 from qrl.export.kernel import INT16, Kernel, accumulator_bound
-from qrl.export.policy import Integral, Memory, Policy
+from qrl.export.policy import Memory, Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, respond
 from qrl.export.targets import FIRMWARE, RELEASE, STRICT, Core, VerificationFailed
 from qrl.export.vectors import Observations, Vectors
@@ -408,14 +408,14 @@ def faults(kernel: Kernel) -> dict[str, Kernel]:
     assert kernel.memory
     assert kernel.memory.integral
     assert kernel.memory.initial_action is not None
-    memory, integral = kernel.memory, kernel.memory.integral
+    memory, integral, first = kernel.memory, kernel.memory.integral, kernel.memory.initial_action
     return {
         "a gain": changed(kernel, gain=integral.gain + 1),
         "a gain's shift": changed(kernel, gain_shift=integral.gain_shift + 1),
         "a radius": changed(kernel, inverse_radius=integral.inverse_radius - 1),
         "the limit": changed(kernel, limit=integral.limit - 1),
         "an axis": changed(kernel, position=integral.position[::-1]),
-        "the first action": changed(kernel, initial_action=memory.initial_action + 2 ** memory.shift[:2]),
+        "the first action": changed(kernel, initial_action=first + 2 ** memory.shift[:2]),
         "an input's shift": changed(kernel, shift=memory.shift + 1),
         "an input's range": changed(kernel, low=memory.low + (np.arange(len(memory.low)) == 0) * 300),
         "a position's shift": replace(kernel, obs_shift=kernel.obs_shift ^ (kernel.obs_shift > 0)),
@@ -623,7 +623,7 @@ def test_the_manifest_says_what_the_state_holds(which: str) -> None:
     assert (found["memory"]["previous_action"] is not None) == memory.previous_action
     if memory.previous_action and sizes == HOVER:
         np.testing.assert_allclose(found["memory"]["previous_action"]["after_reset"], 0.667 * 9.81 / 4, rtol=1e-3)
-    if isinstance(memory.integral, Integral):
+    if memory.integral and kernel.memory and kernel.memory.integral:
         integral = found["memory"]["integral"]
         assert integral["of"] == [policy.observations[i].name for i in memory.integral.position]
         assert (integral["radius_m"], integral["limit_m_s"]) == (memory.integral.radius_m, memory.integral.limit_m_s)

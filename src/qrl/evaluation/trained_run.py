@@ -27,9 +27,10 @@ from qrl.export.policy import ActionSpec, Memory, ObservationSpec, Policy, Prove
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
+from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput
-from qrl_envs.task import QuadrotorTask
-from qrl_envs.vehicle import Vehicle, shipped_vehicles, vehicle_data
+from qrl_envs.task import QuadrotorTask, Task
+from qrl_envs.vehicle import shipped_vehicles
 
 HostStep = Callable[[NDArray[np.integer], NDArray[np.float32]], tuple[NDArray[Any], NDArray[np.floating]]]
 """Memory [n, S] and observation [n, I] of n flights -> next memory, and action [n, A] in SI units."""
@@ -159,7 +160,7 @@ class TrainedRun:
                 run=self.folder.resolve().name,
                 task=self.config.task.name,
                 description=self.task.description if self.task else "an environment without a task file",
-                vehicle=self._vehicle(),
+                vehicle=vehicle_name(self.task),
                 commit=self.config.versions.get("commit", "unknown"),
                 seed=self.config.seed,
                 env_steps=self.env_steps,
@@ -187,13 +188,6 @@ class TrainedRun:
         """The memory that the task gives its policy; none does yet."""
         return None
 
-    def _vehicle(self) -> str | None:
-        """The name of the shipped vehicle that the task flies."""
-        if not isinstance(self.task, QuadrotorTask):
-            return None
-        flown = self.task.vehicle
-        return next((n for n in shipped_vehicles() if Vehicle.model_validate(vehicle_data(n)) == flown), None)
-
     def _control_period_s(self) -> float:
         period = self.task.control_period_s if self.task else adapt(self.env).control_period_s
         if period is None:
@@ -213,6 +207,14 @@ class TrainedRun:
             tuple(ObservationSpec(f"o{i}", "?", frame) for i in range(sizes[0])),
             tuple(replace(action, name=f"a{i}") for i in range(sizes[1])),
         )
+
+
+def vehicle_name(task: Task | None) -> str | None:
+    """The name of the shipped vehicle that the task flies; None if it flies another, or none."""
+    if not isinstance(task, QuadrotorTask):
+        return None
+    shipped = {name: task_spec.load("hover", name) for name in shipped_vehicles()}
+    return next((name for name, hover in shipped.items() if getattr(hover, "vehicle", None) == task.vehicle), None)
 
 
 def inputs_in_si(policy: Policy, observation: NDArray[np.floating]) -> NDArray[np.float64]:

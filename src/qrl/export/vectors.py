@@ -121,7 +121,7 @@ def golden(policy: Policy, kernel: Kernel, n: int = 256) -> Vectors:
     obs = obs[np.isfinite(obs).all(axis=1)]
     _, status, act = reference.step(kernel, reference.initial_state(kernel, len(obs)), obs)
     if kernel.memory:  # first of all, where it shows: no action at a limit, and the integral moves
-        at_limit = np.isin(act[: n // 2] / kernel.act_lsb, [kernel.act_min, kernel.act_max]).sum(axis=1)
+        at_limit = np.isin(np.round(act[: n // 2] / kernel.act_lsb), [kernel.act_min, kernel.act_max]).sum(axis=1)
         moves = np.zeros(n // 2)
         if policy.memory and (integral := policy.memory.integral):
             distance = np.linalg.norm(obs[: n // 2, list(integral.position)].astype(np.float64), axis=1)
