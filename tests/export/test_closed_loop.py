@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from brax.envs.base import State
 
-from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
+from qrl.evaluation.trained_run import TrainedRun, flown_inputs, inputs_in_si
 from qrl.export import kernel as reference
 from qrl.export.policy import ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
 from qrl.export.quantize import quantize
@@ -28,9 +28,9 @@ class World(NamedTuple):
 
 
 class Pushed:
-    """A mass of 1 kg pushed by a constant force, with lag; observation: p, v, the previous a, the integral of p."""
+    """A mass of 1 kg pushed by a constant force, with lag; observed: p, v, the previous a, the integral of p, more."""
 
-    observation_size, action_size, dt, episode_steps = 12, 3, PERIOD_S, 900
+    observation_size, action_size, dt, episode_steps = 14, 3, PERIOD_S, 900
 
     def reset(self, rng: jax.Array) -> State:
         p, zero = jax.random.uniform(rng, (3,), minval=-1.5, maxval=1.5), jnp.zeros(3)
@@ -47,7 +47,8 @@ class Pushed:
         integral = jnp.clip(world.integral + PERIOD_S * gate * world.p, -LIMIT_M_S, LIMIT_M_S)
         world = world._replace(integral=integral)
         zero = jnp.zeros(())
-        return State(cast(Any, world), jnp.concatenate(world), zero, zero)
+        unseen = jnp.full(2, 7.0)  # a critic's
+        return State(cast(Any, world), jnp.concatenate([*world, unseen]), zero, zero)
 
 
 def made_policy() -> Policy:
@@ -112,7 +113,26 @@ def test_the_integer_policy_flies_with_its_own_memory(run: TrainedRun) -> None:
     assert np.abs(positions[0] - positions[1]).max() < 0.02
     for position in positions:
         assert np.abs(position[:, -50:]).max() < 2e-3
-    assert np.abs(np.asarray(flown[1].observations)[:, -1, 9:]).min() > 0.1  # the integral that holds against the push
+    assert (
+        np.abs(np.asarray(flown[1].observations)[:, -1, 9:12]).min() > 0.1
+    )  # the integral that holds against the push
+
+
+def test_the_inputs_of_a_flight_are_those_that_the_environment_gave(run: TrainedRun) -> None:
+    """Recovered from measurements and actions; a flight that ended has none."""
+    policy = run.float_policy()
+    keys = jax.random.split(jax.random.PRNGKey(7), STARTS)
+    flights = run.fly_host_policy(
+        lambda memory, o: (memory, policy(inputs_in_si(policy, o))), np.zeros((STARTS, 0), int), keys
+    )
+    wanted = inputs_in_si(policy, np.asarray(flights.observations)[:, :-1])
+    np.testing.assert_allclose(flown_inputs(policy, flights), wanted, atol=2e-5)
+    ended = np.asarray(flights.observations).copy()
+    ended[3, 40:] = np.nan
+    found = flown_inputs(policy, flights._replace(observations=ended))
+    assert np.isfinite(found[3, :40]).all()
+    assert np.isnan(found[3, 40:]).any(axis=-1).all()
+    np.testing.assert_allclose(np.delete(found, 3, axis=0), np.delete(wanted, 3, axis=0), atol=2e-5)
 
 
 def test_the_float_policys_own_memory_is_the_environments(run: TrainedRun) -> None:

@@ -16,7 +16,7 @@ from qrl.algorithm.flights import Flights, summarize
 from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
-from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
+from qrl.evaluation.trained_run import TrainedRun, flown_inputs
 from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
@@ -122,9 +122,9 @@ def _measured(
     float_flights = run.fly(keys)
     integer_flights = run.fly_host_policy(integer, reference.initial_state(kernel, starts), keys)
     # Every step of the transient, where the errors are; the observations of a settled vehicle repeat.
-    observations = inputs_in_si(policy, np.asarray(float_flights.observations[:, :-1])).astype(np.float32)
+    inputs = flown_inputs(policy, float_flights)
     transient = 2 * calibration.TRANSIENT_STEPS
-    parts = observations[:, :transient], observations[:, transient::4]
+    parts = inputs[:, :transient], inputs[:, transient::4]
     flown = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
     flown = flown[np.isfinite(flown).all(axis=1)]
     tail = run.tail_steps()

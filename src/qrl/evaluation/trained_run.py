@@ -137,23 +137,23 @@ class TrainedRun:
         starts = calibration_starts(calibration.STARTS)
         none = np.zeros((len(starts), 0), np.int32)
         flown = self.fly_host_policy(step, none, starts, from_envelope=calibration.FROM_ENVELOPE)
-        inputs = inputs_in_si(policy, np.asarray(flown.observations[:, :-1]))
-        return replace(policy, calibration=calibration.select(inputs.astype(np.float32)))
+        return replace(policy, calibration=calibration.select(flown_inputs(policy, flown)))
 
     def float_policy(self, memory: Memory | None = None) -> Policy:
         """The policy as a value in SI units, without observations to calibrate on.
 
         With `memory`, by default the task's, the environment's observation is the measured one [F], then what `Memory`
-        says in its order: the previous action a [A] in [−1, 1], the integral [3] in m·s.
+        says in its order: the previous action a [A] in [−1, 1], the integral [3] in m·s; then what the policy does not
+        see, if anything.
         """
         memory = memory or self._memory()
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
         layers = deployed.params.policy["params"]
-        size = len(deployed.statistics.mean)
+        size = len(layers["Dense_0"]["kernel"])  # of what the policy sees
         normalize = config.normalize_observations
         observations, actions = self._specs()
-        mean = np.asarray(deployed.statistics.mean) if normalize else np.zeros(size)
-        gain = 1.0 / np.asarray(std(deployed.statistics)) if normalize else np.ones(size)
+        mean = np.asarray(deployed.statistics.mean)[:size] if normalize else np.zeros(size)
+        gain = 1.0 / np.asarray(std(deployed.statistics))[:size] if normalize else np.ones(size)
         offset_si, scale_si = _units(actions, size, memory)
         return Policy(
             provenance=Provenance(
@@ -171,7 +171,7 @@ class TrainedRun:
             observation_offset=offset_si + scale_si * mean,
             observation_gain=gain / scale_si,
             observation_clip=MAX_NORMALIZED if normalize else np.inf,
-            observation_scale=np.asarray(config.observation_scale or np.ones(size)),
+            observation_scale=np.asarray(config.observation_scale or np.ones(size))[:size],
             layers=tuple((layers[f"Dense_{i}"]["kernel"], layers[f"Dense_{i}"]["bias"]) for i in range(len(layers))),
             activation=config.activation,
             calibration=np.zeros((0, size), np.float32),
@@ -218,9 +218,29 @@ def vehicle_name(task: Task | None) -> str | None:
 
 
 def inputs_in_si(policy: Policy, observation: NDArray[np.floating]) -> NDArray[np.float64]:
-    """The policy's inputs [..., I] in SI units, of the environment's observation [..., I]."""
-    offset, scale = _units(policy.actions, observation.shape[-1], policy.memory)
-    return offset + scale * observation
+    """The policy's inputs [..., I] in SI units, of the environment's observation, which begins with them."""
+    size = len(policy.observation_scale)
+    offset, scale = _units(policy.actions, size, policy.memory)
+    return offset + scale * observation[..., :size]
+
+
+def flown_inputs(policy: Policy, flights: Flights) -> NDArray[np.float32]:
+    """The policy's inputs [n, steps, I] in SI units at each step of its flights, NaN from where one ended early.
+
+    A flight's observations are the measured ones; what the policy remembered follows from them and the actions.
+    """
+    measured = np.asarray(flights.observations)[:, :-1, : len(policy.observations)]
+    parts = [measured]
+    if policy.memory and policy.memory.previous_action:
+        actions = policy.to_si(np.asarray(flights.actions))
+        first = policy.initial_memory(len(actions))[:, None, : actions.shape[-1]]
+        parts.append(np.concatenate([first, actions[:, :-1]], axis=1))
+    if policy.memory and policy.memory.integral:
+        totals = [np.zeros((len(measured), 3))]
+        for observation in measured.swapaxes(0, 1):
+            totals.append(policy.integrated(totals[-1], observation))
+        parts.append(np.stack(totals[1:], axis=1))
+    return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 def _units(actions: tuple[ActionSpec, ...], size: int, memory: Memory | None) -> tuple[Any, Any]:

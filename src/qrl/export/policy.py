@@ -130,17 +130,22 @@ class Policy:
         observation = np.asarray(observation, np.float64)
         finite = np.isfinite(observation).all(axis=-1, keepdims=True)
         observation, before = np.where(finite, observation, 0.0), memory
-        if self.memory and (integral := self.memory.integral):
-            p = observation[:, list(integral.position)]
-            gate = np.maximum(0.0, 1.0 - (p**2).sum(axis=-1, keepdims=True) / integral.radius_m**2) ** 2
-            total = memory[:, -3:] + self.control_period_s * gate * p
-            limited = np.clip(total, -integral.limit_m_s, integral.limit_m_s)
-            memory = np.concatenate([memory[:, :-3], limited], axis=-1)
+        if self.memory and self.memory.integral:
+            memory = np.concatenate([memory[:, :-3], self.integrated(memory[:, -3:], observation)], axis=-1)
         action = self(np.concatenate([observation, memory], axis=-1))
         if self.memory and self.memory.previous_action:
             memory = np.concatenate([action, memory[:, action.shape[-1] :]], axis=-1)
         safe = np.array([port.safe for port in self.actions])
         return np.where(finite, memory, before), np.where(finite, action, safe)
+
+    def integrated(self, total: NDArray[np.float64], observation: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The next integral [n, 3] for measured observations [n, F]."""
+        assert self.memory
+        assert self.memory.integral
+        integral = self.memory.integral
+        p = observation[:, list(integral.position)]
+        gate = np.maximum(0.0, 1.0 - (p**2).sum(axis=-1, keepdims=True) / integral.radius_m**2) ** 2
+        return np.clip(total + self.control_period_s * gate * p, -integral.limit_m_s, integral.limit_m_s)
 
     def to_si(self, a: NDArray[np.floating]) -> NDArray[np.float64]:
         """Action [..., A] in SI units of the network's output a."""
