@@ -190,6 +190,7 @@ def test_resume_of_another_run_is_refused(
         ([], "no task given"),
         (["nowhere.json"], "nowhere.json: cannot be read"),
         (["hover", "--num-timestepz", "3"], "unknown flag --num-timestepz (did you mean --num-timesteps?)"),
+        (["hover", "--step", "3"], "unknown flag --step (did you mean --num-timesteps?)"),  # near the former --steps
         (
             ["hover", "--num-timesteps", "many"],
             "command line: key 'num_timesteps': expected a valid integer, found \"many\"",

@@ -119,9 +119,9 @@ def test_the_page_holds_the_flights(name: str) -> None:
 
 
 def test_the_speed_of_a_clockwise_circle_has_an_axis_the_right_way_up() -> None:
-    task, flown = tasks.load("circle"), made_up("circle")
-    reward = task.evaluation.reward.model_copy(update={"speed_m_s": -2.0})
-    task = task.model_copy(update={"evaluation": task.evaluation.model_copy(update={"reward": reward})})
+    wanted = {"reward": {"speed_m_s": -2.0}}
+    task = tasks.from_data({"extend": "circle", **wanted, "evaluation": wanted}, "mine")
+    flown = made_up("circle")
     flown.observations[..., [10, 13]] *= -1.0  # mirrored: the flights are clockwise too
     low, high = data_of(viewer.page(task, "mine", flown))["panels"][0]["limits"]
     assert -6.5 < low <= -3.0 < high < 2.5

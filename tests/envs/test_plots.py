@@ -319,9 +319,8 @@ def test_seeds_that_reported_at_other_times_are_interpolated() -> None:
 
 def test_the_speed_of_a_clockwise_circle_is_shown_the_right_way_up() -> None:
     for speed in (2.0, -2.0):
-        reward = task.load("circle").evaluation.reward.model_copy(update={"speed_m_s": speed})
-        spec = task.load("circle").model_copy(update={"reward": reward})
-        spec = spec.model_copy(update={"evaluation": spec.evaluation.model_copy(update={"reward": reward})})
+        wanted = {"reward": {"speed_m_s": speed}}
+        spec = task.from_data({"extend": "circle", **wanted, "evaluation": wanted}, "mine")
         mirrored = approach("circle") * np.where(np.isin(np.arange(18), (10, 13)), np.sign(speed), 1.0)
         low, high = flights_of.figure(spec, mirrored).axes[2].get_ylim()
         assert min(-speed, 3 * speed) <= low < speed < high <= max(-speed, 3 * speed)

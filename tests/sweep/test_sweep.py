@@ -18,6 +18,7 @@ import pytest
 
 from cli_helpers import TINY_VALUES, complaint, qrl
 from qrl.cli import sweep
+from qrl.config import FORMER_NAMES
 from qrl.runs import files
 from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import load
@@ -279,6 +280,20 @@ def test_a_folder_of_something_else_is_refused(done: Path, tmp_path: Path, capsy
     (run / "config.json").write_text("{}")
     assert "holds a run" in complaint(capsys, "sweep", other, "--out", run)
     assert "it is a file" in complaint(capsys, "sweep", other, "--out", other)
+
+
+def test_a_sweep_of_the_first_version_is_refused(
+    done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its hyperparameters have their former names: it is not this sweep, even where the grid is the same."""
+    stored = json.loads((done / "grid.json").read_text())
+    for point in stored["points"]:
+        point["learner"] = {former: point["learner"].get(name) for former, name in FORMER_NAMES.items()}
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "grid.json").write_text(json.dumps(stored))
+    said = complaint(capsys, "sweep", done.parent / "grid.json", "--out", tmp_path / "out")
+    assert "by another version of qrl" in said
+    assert str(tmp_path / "out" / "grid.json") in said
 
 
 def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -82,7 +82,14 @@ def _map(figure: Figure, axes: Axes, cells: np.ndarray, edges: np.ndarray) -> No
             continue
         x, y = TILT_EDGES_DEG[j : j + 2].mean(), edges[i : i + 2].mean()
         color = "white" if value < (low + high) / 2 else INK
-        text = axes.text(x, y, f"{value:.2g}" if value < 10 else f"{value:.0f}", color=color, fontsize=9.5, zorder=5)
+        text = axes.text(
+            x,
+            y,
+            f"{value:.2f}" if value < 1 else f"{value:.1f}" if value < 10 else f"{value:.0f}",
+            color=color,
+            fontsize=9.5,
+            zorder=5,
+        )
         text.set(ha="center", va="center")
         if np.isinf(value):
             text.set(text="never", path_effects=[withStroke(linewidth=3, foreground="white")])  # over the crosses

@@ -98,7 +98,7 @@ for (const flight of page.flights) $("start").add(new Option(flight.label, fligh
 for (const rate of RATES) $("rate").add(new Option(`×${rate}`, rate, rate === 1, rate === 1));
 $("scrub").max = page.end_s;
 $("play").textContent = "►";
-$("legend").innerHTML = `<i style="background:#eceef1"></i>judged: the last ${page.tail_s} s<i style="background:#009E732b"></i>`
+$("legend").innerHTML = `<i style="background:#eceef1"></i>evaluated: the last ${page.tail_s} s<i style="background:#009E732b"></i>`
   + `within tolerance${page.vehicle ? "<span>f1 ↖: front left, from above</span>" : ""}`;
 
 const scene = page.rod ? rodScene($("scene"), page) : vehicleScene($("scene"), page, remember);

@@ -33,7 +33,7 @@ class _Parser(argparse.ArgumentParser):
 
     def refuse(self, word: str, former: Mapping[str, str]) -> NoReturn:
         """Exit with the flag that `word` is nearest to; where that is a `former` one, with its current name."""
-        flags = {flag: flag for action in self._actions for flag in action.option_strings} | former
+        flags = {**{flag: flag for action in self._actions for flag in action.option_strings}, **former}
         close = difflib.get_close_matches(word.split("=")[0], flags, n=1) if word.startswith("-") else []
         self.error(
             f"unknown {'flag' if word.startswith('-') else 'argument'} {word}"

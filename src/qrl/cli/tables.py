@@ -28,6 +28,7 @@ def checkpoints(result: dict[str, Any]) -> None:
     columns = {f"{one['env_steps']:,}": one for one in result["checkpoints"]}
     console.print(f"\nseed {result['seed']}, last {len(columns)} checkpoints by environment steps")
     table({head: {k: v for k, v in one.items() if k != "env_steps"} for head, one in columns.items()})
+    console.print()
 
 
 def off_nominal(title: str, result: dict[str, Any]) -> None:
@@ -54,4 +55,6 @@ def _cell(name: str, one: dict[str, Any]) -> str:
     value = one[name]
     if name == "env_steps":
         return f"{value:,}"
-    return f"{value:.2f}" if name.startswith("return") else f"{value:.4f}"
+    if name.startswith("return"):
+        return f"{value:.2f}"
+    return f"{value:.1e}" if 0.0 < abs(value) < 5e-4 else f"{value:.4f}"  # an error of 0.1 mm is not 0

@@ -174,7 +174,7 @@ def write_results(plan: Plan, finished: loop.Finished, seconds: float) -> None:
     console.print(f"done in {clock(seconds)}: {out}/summary.json, learning_curve.png; next: make evaluate RUN={out}")
     for i, rows in enumerate(history):
         if flies(rows[-1]) is False:
-            console.print(f"seed {config.seed + i} {_shortfall(rows[-1], config.learner)}")
+            console.print(f"seed {config.seed + i} {_shortfall(rows[-1], config)}")
 
 
 def flies(last: Row) -> bool | None:
@@ -182,13 +182,13 @@ def flies(last: Row) -> bool | None:
     return None if np.isnan(last["success"]) else bool(last["success"] >= FLIES)
 
 
-def _shortfall(last: Row, config: Config) -> str:
+def _shortfall(last: Row, run: RunConfig) -> str:
     """What a policy that does not do its task does, and what to try."""
     ends = f", and {last['ended_early']:.0%} of its episodes left the bounds" if last["ended_early"] > 0.01 else ""
-    longer = f"--num-timesteps {2 * config.num_timesteps}"
+    easier = ", starts within a smaller tilt (start.tilt_rad in the task file), a vehicle with more thrust"
     return (
-        f"does its task from {last['success']:.0%} of the reports' starts only{ends}. To try: {longer}, another SEED,"
-        " starts within a tilt (start.tilt_rad in the task file), a vehicle with more thrust"
+        f"does its task from only {last['success']:.0%} of the reports' starts{ends}. To try: --num-timesteps"
+        f" {2 * run.learner.num_timesteps}, another SEED{easier if 'vehicle' in (run.task.spec or {}) else ''}"
     )
 
 
