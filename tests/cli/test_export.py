@@ -100,7 +100,7 @@ def test_failed_gates_are_a_warning(run: Path, capsys: pytest.CaptureFixture[str
     title, empty, warning, *_ = (run / "export" / "report.md").read_text().splitlines()
     assert title.startswith("# pendulum: 3-4-1")
     assert not empty
-    assert warning.startswith("> **Warning: failed: RMS action error ")
+    assert warning.startswith("> **Warning: failed: RMS action error: ")
     assert "FAILED" in capsys.readouterr().out
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from brax.envs.base import State
 
+from qrl.evaluation import calibration
 from qrl.evaluation.trained_run import TrainedRun, flown_inputs, inputs_in_si
 from qrl.export import kernel as reference
 from qrl.export.policy import ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
@@ -90,8 +91,9 @@ def run() -> TrainedRun:
     return found
 
 
-def test_the_integer_policy_flies_with_its_own_memory(run: TrainedRun) -> None:
+def test_the_integer_policy_flies_with_its_own_memory(run: TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """From measurements alone it does what the float policy does with the environment's memory, and settles."""
+    monkeypatch.setattr(calibration, "STARTS", 50)
     policy = run.policy()
     assert policy.calibration.shape[1] == 12
     np.testing.assert_allclose(policy.calibration[:, 6:9].max(axis=0), OFFSET_N + SCALE_N, atol=2.5)
