@@ -93,7 +93,7 @@ def run() -> TrainedRun:
 
 def test_the_integer_policy_flies_with_its_own_memory(run: TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
     """From measurements alone it does what the float policy does with the environment's memory, and settles."""
-    monkeypatch.setattr(calibration, "STARTS", 50)
+    monkeypatch.setattr(calibration, "STARTS", 100)
     policy = run.policy()
     assert policy.calibration.shape[1] == 12
     np.testing.assert_allclose(policy.calibration[:, 6:9].max(axis=0), OFFSET_N + SCALE_N, atol=2.5)
