@@ -22,6 +22,7 @@ define HELP
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
        ARGS=--off-nominal              any flag of `qrl evaluate`; "--beside runs/ppo": other runs too
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, verified bit for bit
+       NAME=hover                      prefix of all its names in C (default qrl_TASK)
   make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
        ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE
   make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; rerun to resume
@@ -78,7 +79,7 @@ evaluate: $(STAMP)
 
 # `export` is a directive of make itself where a line begins with it.
 $(or export): $(STAMP)
-	@exec $(QRL) export $(call quoted,$(RUN)) $(ARGS)
+	@exec $(QRL) export $(call quoted,$(RUN)) $(call flag,--name,$(NAME)) $(ARGS)
 
 view: $(STAMP)
 	@exec $(QRL) view $(call quoted,$(RUN)) $(ARGS)

@@ -111,9 +111,11 @@ pendulum_and_hover() {
   complete "$out/pendulum/seed-0"
   complete "$out/pendulum/seed-1"
 
-  passes "export a seed" make export RUN="$out/pendulum/seed-0" ARGS="--starts 100 --vectors 500"
+  passes "export a seed" make export RUN="$out/pendulum/seed-0" NAME=swing_up ARGS="--starts 100 --vectors 500"
+  test -e "$out/pendulum/seed-0/export/swing_up.c" || fail "the kernel has another name"
   passes "build and run the exported example" make -C "$out/pendulum/seed-0/export/examples/bare_metal"
   grep -q '^torque: ' "$log/stdout" || fail "the example gave no torque"
+  refuses "a name that C cannot have" "expected a C identifier" "$qrl" export "$out/pendulum/seed-0" --name swing-up
   refuses "to export two seeds at once" "seed-0" "$qrl" export "$out/pendulum"
   passes "view two seeds" make view RUN="$out/pendulum" ARGS="--starts 3 900"
   page "$out/pendulum/seed-0/view.html"

@@ -172,7 +172,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code":
             exec(compile("".join(cell["source"]), "first_flight.ipynb", "exec"), namespace)
-    assert (tmp_path / "runs" / "notebook" / "export" / "qrl_policy.c").exists()
+    assert (tmp_path / "runs" / "notebook" / "export" / "qrl_pendulum.c").exists()
 
 
 def test_the_readme_snippet_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

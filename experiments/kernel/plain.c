@@ -1,7 +1,7 @@
-/* The same network in plain C with the kernel's interface, as a baseline for costs:
-   qrl_policy_step is float32 with the C library's tanhf; qrl_policy_step_i16 is int8 with one scale per tensor,
-   and its int16 arguments hold int8 values. */
-#include "qrl_policy.h"
+/* The same network in plain C with the kernel's interface, as a plain for costs:
+   plain_step is float32 with the C library's tanhf; plain_step_i16 is int8 with one scale per tensor,
+   and its int16 arguments hold int8 values. Without memory: that of a policy is among the observations. */
+#include "plain.h"
 
 #include <math.h>
 
@@ -17,8 +17,11 @@ struct layer {
 
 #include "plain_data.h"
 
-int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE])
+void plain_reset(plain_state *state) { state->unused = 0; }
+
+int plain_step(plain_state *state, const float obs[PLAIN_OBS_SIZE], float act[PLAIN_ACT_SIZE])
 {
+    (void)state;
     float values[2][WIDEST];
     const float *x = obs;
     for (int l = 0; l < LAYERS; l++) {
@@ -36,10 +39,11 @@ int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_A
     return 0;
 }
 
-int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE])
+int plain_step_i16(plain_state *state, const int16_t obs[PLAIN_OBS_SIZE], int16_t act[PLAIN_ACT_SIZE])
 {
+    (void)state;
     int8_t values[2][WIDEST];
-    for (int i = 0; i < QRL_POLICY_OBS_SIZE; i++) {
+    for (int i = 0; i < PLAIN_OBS_SIZE; i++) {
         values[0][i] = (int8_t)obs[i];
     }
     for (int l = 0; l < LAYERS; l++) {
@@ -56,10 +60,10 @@ int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_
             y[o] = layer->table ? layer->table[y8 + 128] : (int8_t)y8;
         }
     }
-    for (int o = 0; o < QRL_POLICY_ACT_SIZE; o++) {
+    for (int o = 0; o < PLAIN_ACT_SIZE; o++) {
         act[o] = values[LAYERS % 2][o];
     }
     return 0;
 }
 
-int qrl_policy_selftest(void) { return 0; }
+int plain_selftest(void) { return 0; }

@@ -1,5 +1,10 @@
 #include <stdint.h>
 
-int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]);
-int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]);
-int qrl_policy_selftest(void);
+typedef struct {
+    uint8_t unused;
+} plain_state;
+
+void plain_reset(plain_state *state);
+int plain_step(plain_state *state, const float obs[PLAIN_OBS_SIZE], float act[PLAIN_ACT_SIZE]);
+int plain_step_i16(plain_state *state, const int16_t obs[PLAIN_OBS_SIZE], int16_t act[PLAIN_ACT_SIZE]);
+int plain_selftest(void);

@@ -20,6 +20,7 @@ from qrl.export import targets
 from qrl.export.accuracy import accuracy
 from qrl.export.quantize import si_layers
 from qrl.export.targets import CORES, Floats, Ints, VerificationFailed
+from qrl.export.vectors import Observations
 from qrl_envs.specfile import BadInput
 
 SOURCES = Path(__file__).parent
@@ -119,15 +120,15 @@ def _array(kind: str, name: str, values: Iterable[str]) -> str:
     return f"static const {kind} {name}[] = {{{', '.join(values)}}};\n"
 
 
-def write(folder: Path, layers: Layers, activation: str, obs: Floats) -> None:
-    """A kernel folder for `run_core(..., libraries=LIBRARIES)`; its int16 entry point is the naive int8 network."""
+def write(folder: Path, layers: Layers, activation: str, obs: Floats) -> Path:
+    """A kernel in `folder` for `run_core(..., libraries=LIBRARIES)`; its int16 entry is the naive int8 network."""
     folder.mkdir(parents=True, exist_ok=True)
     inputs, outputs = layers[0][0].shape[0], layers[-1][0].shape[1]
     header = (SOURCES / "plain.h").read_text(encoding="utf-8")
-    sizes = f"#define QRL_POLICY_OBS_SIZE {inputs}\n#define QRL_POLICY_ACT_SIZE {outputs}\n"
-    (folder / "qrl_policy.h").write_text(sizes + header, encoding="utf-8")
+    sizes = f"#define PLAIN_OBS_SIZE {inputs}\n#define PLAIN_ACT_SIZE {outputs}\n"
+    (folder / "plain.h").write_text(sizes + header, encoding="utf-8")
     (folder / "plain_data.h").write_text(data(layers, activation, obs), encoding="utf-8")
-    shutil.copy(SOURCES / "plain.c", folder / "qrl_policy.c")
+    return Path(shutil.copy(SOURCES / "plain.c", folder))
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -152,10 +153,11 @@ def main(argv: list[str] | None = None) -> int:
     print(f"{'instructions per inference':<27} {'plain float32':>14} {'naive int8':>11}")
     with TemporaryDirectory() as scratch:
         work = Path(scratch)
-        write(work / "plain", layers, policy.activation, sample)
+        kernel = write(work / "plain", layers, policy.activation, sample)
+        given = Observations(obs, to_int8(network, obs))
         for core in CORES:
             try:
-                _, counts = targets.run_core(core, work / "plain", work, FLAGS, obs, to_int8(network, obs), LIBRARIES)
+                _, counts = targets.run_core(core, kernel, work, FLAGS, given, LIBRARIES)
                 print(f"{core.name:<27} {counts.f32.mean():>14,.0f} {counts.i16.mean():>11,.0f}")
             except VerificationFailed as failure:
                 print(f"{core.name:<27} {failure}")

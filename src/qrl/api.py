@@ -32,7 +32,7 @@ from qrl.cli.main import configure_jax
 from qrl.cli.terminal import console
 from qrl.config import FORMER_NAMES, Config, current_names
 from qrl.evaluation.starts import evaluation_starts
-from qrl.evaluation.trained_run import TrainedRun
+from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
 from qrl.runs.record import RunConfig
 from qrl_envs.specfile import BadInput, CountOrZero, nearest
 
@@ -52,7 +52,7 @@ class DeployedPolicy:
         self._run = run
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float64]:
-        return self._numpy(np.asarray(observation))
+        return self._numpy(inputs_in_si(self._numpy, np.asarray(observation)))
 
     def init_memory(self) -> tuple[()]:
         """Memory at the start of a flight; empty for a feed-forward policy."""
@@ -91,12 +91,14 @@ class Run:
         """Return, success, settle times and steady-state errors from that many evaluation starts."""
         return summarize(self.fly(starts))
 
-    def export(self, starts: int = 1000, vectors: int = 2000) -> Path:
+    def export(self, starts: int = 1000, vectors: int = 2000, name: str | None = None) -> Path:
         """Write the C kernel to `folder/export`, verified on `vectors` inputs and flown from `starts`; that folder.
+
+        name: prefix of all its names in C, by default `qrl_` and the task's name
 
         Raises BadInput for a network that the kernel cannot represent, AccumulatorOverflow and VerificationFailed.
         """
-        export_run(self._trained, starts, vectors, lambda line: None)
+        export_run(self._trained, starts, vectors, lambda line: None, name)
         return self.folder / "export"
 
 

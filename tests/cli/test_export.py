@@ -4,20 +4,26 @@ import json
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from brax.envs.fast import Fast
 
 import policies
 from cli_helpers import TINY, complaint, qrl
+from qrl import tasks
 from qrl.cli import export
 from qrl.evaluation import calibration
+from qrl.evaluation.trained_run import TrainedRun, inputs_in_si, vehicle_name
 from qrl.export import targets
 from qrl.export.kernel import AccumulatorOverflow
+from qrl.export.policy import Memory
 from qrl.export.quantize import UnsupportedNetwork
 from qrl.export.targets import VerificationFailed
+from qrl_envs.task import QuadrotorTask
+from qrl_envs.vehicle import shipped_vehicles
 
 LEAST = ("--starts", "8", "--vectors", "500")
-FILES = policies.EMITTED | {"report.md"}
+FILES = policies.emitted_files("qrl_pendulum") | {"report.md"}
 
 
 @pytest.fixture(autouse=True)
@@ -42,7 +48,7 @@ def test_an_export_is_whole_and_the_same_again(run: Path, capsys: pytest.Capture
     assert qrl("export", run, *LEAST) == 0
     said = capsys.readouterr().out
     assert "skipped Cortex-M and its costs: the cross compiler not found" in said
-    assert f"{run}/export/qrl_policy.c" in said
+    assert f"{run}/export/qrl_pendulum.c" in said
     first = contents(run / "export")
     assert set(first) == FILES
     manifest = json.loads(first["manifest.json"])
@@ -76,7 +82,7 @@ def test_a_verification_that_fails_leaves_what_was_there(
     for had in (False, True):
         if had:
             (run / "export").mkdir()
-            (run / "export" / "qrl_policy.c").write_text("earlier")
+            (run / "export" / "qrl_pendulum.c").write_text("earlier")
             before = contents(run)
         capsys.readouterr()
         assert qrl("export", run, *LEAST) == 1
@@ -94,7 +100,7 @@ def test_failed_gates_are_a_warning(run: Path, capsys: pytest.CaptureFixture[str
     title, empty, warning, *_ = (run / "export" / "report.md").read_text().splitlines()
     assert title.startswith("# pendulum: 3-4-1")
     assert not empty
-    assert warning.startswith("> **Warning: failed: RMS action error ")
+    assert warning.startswith("> **Warning: failed: RMS action error: ")
     assert "FAILED" in capsys.readouterr().out
 
 
@@ -129,7 +135,36 @@ def test_a_foreign_environment_exports(
     assert [port["name"] for port in manifest["obs"]] == ["o0", "o1"]
     assert [(port["name"], port["unit"]) for port in manifest["act"]] == [("a0", "?")]
     assert manifest["control_period_s"] == 0.02
-    assert set(contents(run / "export")) == FILES
+    assert set(contents(run / "export")) == policies.emitted_files("qrl_fast") | {"report.md"}
+
+
+def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
+    """As if the last observation of the pendulum were the previous action a: the policy has it in N m."""
+    loaded = TrainedRun.load(run)
+    observations, actions = loaded._specs()
+    loaded._specs = lambda: (observations[:2], actions)
+    policy = loaded.float_policy(Memory(previous_action=True, integral=None))
+    seen = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)).astype(np.float32)
+    inputs = inputs_in_si(policy, seen)
+    np.testing.assert_allclose(inputs, seen * [1.0, 1.0, 2.0])  # the greatest torque is 2 N m
+    wanted = 2.0 * np.clip(np.asarray(loaded.policy_mean(seen)), -1.0, 1.0)
+    assert np.ptp(wanted) > 1e-3
+    np.testing.assert_allclose(policy(inputs), wanted, atol=1e-5)
+    memory, action = policy.step(inputs[:, 2:], inputs[:, :2])
+    np.testing.assert_allclose(action, wanted, atol=1e-5)
+    np.testing.assert_array_equal(memory, action)
+
+
+@pytest.mark.parametrize("name", shipped_vehicles())
+def test_a_shipped_vehicle_is_named(name: str) -> None:
+    """As the task that a run records has it, under whatever name that is."""
+    task = tasks.spec(tasks.task_record("hover", name))
+    assert isinstance(task, QuadrotorTask)
+    assert vehicle_name(task) == name
+    heavier = task.model_copy(
+        update={"vehicle": task.vehicle.model_copy(update={"mass_kg": 1.01 * task.vehicle.mass_kg})}
+    )
+    assert vehicle_name(heavier) is None
 
 
 # -- refused -------------------------------------------------------------------------------------------------
@@ -193,6 +228,24 @@ def test_a_network_without_a_form_is_refused(
     monkeypatch.setattr(export, "quantize", fail)
     assert complaint(capsys, "export", run, *LEAST) == f"qrl: {run}: layer 1: a weight is not finite\n"
     assert not (run / "export").exists()
+
+
+@pytest.mark.parametrize("name", ["9lives", "my-policy", "", "a b", "stdint", "../x", "é", "x" * 65])
+def test_a_name_that_c_cannot_have_is_refused(name: str, run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    line = complaint(capsys, "export", run, *LEAST, "--name", name)
+    assert line.startswith(f"qrl: --name '{name}': expected a C identifier")
+    assert not (run / "export").exists()
+
+
+def test_an_export_has_the_name_that_is_given(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And an export of another name replaces it whole."""
+    assert qrl("export", run, *LEAST) == 0
+    assert qrl("export", run, *LEAST, "--name", "swing_up") == 0
+    assert f"{run}/export/swing_up.c" in capsys.readouterr().out
+    assert set(contents(run / "export")) == policies.emitted_files("swing_up") | {"report.md"}
+    manifest = json.loads((run / "export" / "manifest.json").read_text())
+    assert (manifest["format"], manifest["name"], manifest["state_bytes"]) == (2, "swing_up", 1)
+    assert (manifest["vehicle"], manifest["memory"]) == (None, None)
 
 
 @pytest.mark.parametrize("flag", ["--starts", "--vectors"])

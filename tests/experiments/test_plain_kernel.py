@@ -10,6 +10,7 @@ from cross_targets import EITHER
 from experiments.kernel import plain
 from qrl.export import targets
 from qrl.export.targets import RELEASE, Core
+from qrl.export.vectors import Observations
 
 
 def network(rng: np.random.Generator, *widths: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -21,13 +22,14 @@ def network(rng: np.random.Generator, *widths: int) -> list[tuple[np.ndarray, np
 def test_the_plain_kernels_are_the_network(core: Core | None, activation: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     layers, obs = network(rng, 18, 24, 16, 4), rng.normal(size=(40, 18))
-    plain.write(tmp_path / "kernel", layers, activation, obs)
+    kernel = plain.write(tmp_path / "kernel", layers, activation, obs)
     int8 = plain.naive(layers, activation, obs)
     obs_i16 = plain.to_int8(int8, obs)
+    given = Observations(obs, obs_i16)
     if core is None:
-        run = targets.run_host(tmp_path / "kernel", tmp_path, RELEASE, obs, obs_i16, plain.LIBRARIES)
+        run = targets.run_host(kernel, tmp_path, RELEASE, given, plain.LIBRARIES)
     else:
-        run, _ = targets.run_core(core, tmp_path / "kernel", tmp_path, RELEASE, obs, obs_i16, plain.LIBRARIES)
+        run, _ = targets.run_core(core, kernel, tmp_path, RELEASE, given, plain.LIBRARIES)
     act = obs
     for weight, bias in layers[:-1]:
         act = np.tanh(act @ weight + bias) if activation == "tanh" else np.maximum(act @ weight + bias, 0)

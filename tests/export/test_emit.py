@@ -14,13 +14,12 @@ import pytest
 
 import policies
 from cross_targets import need
-from policies import FLAT, HOVER, ODD, PENDULUM, PROVENANCE
+from policies import FLAT, HOVER, NAME, ODD, PENDULUM, PROVENANCE
 from qrl.export import emit, targets, vectors
-from qrl.export import kernel as reference
 from qrl.export.policy import Policy
 from qrl.export.targets import STRICT
 
-HEADER, SOURCE = "qrl_policy.h", "qrl_policy.c"
+HEADER, SOURCE = f"{NAME}.h", f"{NAME}.c"
 EXAMPLE = "examples/bare_metal"
 HOSTILE = {
     "ends the comment": 'a */ int x = *"/ ; /* b',
@@ -40,7 +39,7 @@ HOSTILE = {
 
 def files(sizes: tuple[int, ...] = HOVER, activation: str = "relu", policy: Policy | None = None) -> dict[str, str]:
     policy, kernel = policy or policies.policy(sizes, activation), policies.kernel(sizes, activation)
-    return emit.files(policy, kernel, vectors.golden(policy, kernel))
+    return emit.files(policy, kernel, vectors.golden(policy, kernel), NAME)
 
 
 def named(**changes: str) -> Policy:
@@ -68,7 +67,7 @@ def run(*command: str, cwd: Path) -> str:
 def test_nothing_is_left_to_fill_in(sizes: tuple[int, ...]) -> None:
     """Nor does a file say when or where it was made: the same policy gives the same files."""
     emitted = files(sizes)
-    assert set(emitted) == policies.EMITTED
+    assert set(emitted) == policies.emitted_files()
     for name, text in emitted.items():
         assert not re.search(r"@\w+@", text), name
         assert not re.search(r"(^|[\s\"'(])/(home|tmp|work|root|usr)\b", text), name
@@ -92,9 +91,10 @@ def test_the_manifest_keeps_its_contract() -> None:
     """DESIGN.md, "Kernel"."""
     found = strict_json(files()["manifest.json"])
     kernel = policies.kernel()
-    assert list(found)[:4] == ["format", "task", "run", "commit"]
+    assert list(found)[:6] == ["format", "name", "task", "vehicle", "run", "commit"]
     for key, wanted in {
-        "format": 1,
+        "format": 2,
+        "name": "hover",
         "task": "hover",
         "run": "made-up",
         "commit": "0123456789ab",
@@ -138,11 +138,11 @@ def test_the_manifests_steps_are_the_kernels() -> None:
     found = strict_json(files()["manifest.json"])
     obs_lsb, act_lsb = (np.array([port["lsb"] for port in found[side]]) for side in ("obs", "act"))
     steps = np.round(policy.calibration[:300] / obs_lsb).astype(np.int16)
-    action = reference.step_i16(kernel, steps)[1] * act_lsb
+    action = policies.step_i16(kernel, steps)[1] * act_lsb
     # The 16 bits that the float entry reads of a significand may be a step apart.
     low, high = policy.limits
     np.testing.assert_allclose(
-        action / (high - low), reference.step(kernel, policy.calibration[:300])[1] / (high - low), atol=2e-3
+        action / (high - low), policies.step(kernel, policy.calibration[:300])[1] / (high - low), atol=2e-3
     )
 
 
@@ -157,11 +157,11 @@ def test_the_header_says_what_everything_is(sizes: tuple[int, ...]) -> None:
         assert fact in comment
     assert f"every {policy.control_period_s:g} s" in comment
     for side, ports in (("OBS", policy.observations), ("ACT", policy.actions)):
-        assert f"#define QRL_POLICY_{side}_SIZE {len(ports)}\n" in header
+        assert f"#define HOVER_{side}_SIZE {len(ports)}\n" in header
         for i, port in enumerate(ports):
             assert re.search(rf"\* +{i} +{port.name} +{re.escape(port.unit)} +-?[\d.]+ \.\. .*{port.frame}", comment)
-            assert f"QRL_POLICY_{side}_{port.name.upper()} = {i}" in header
-    assert f"#define QRL_POLICY_PERIOD_US {round(policy.control_period_s * 1e6)}\n" in header
+            assert f"HOVER_{side}_{port.name.upper()} = {i}" in header
+    assert f"#define HOVER_PERIOD_US {round(policy.control_period_s * 1e6)}\n" in header
 
 
 def test_the_header_says_where_each_motor_is_and_how_it_turns() -> None:
@@ -176,7 +176,7 @@ def test_the_header_says_where_each_motor_is_and_how_it_turns() -> None:
 def test_the_headers_steps_are_the_kernels() -> None:
     header, kernel = files()[HEADER], policies.kernel()
     for side, lsb in (("OBS", kernel.lsb), ("ACT", kernel.act_lsb)):
-        values = re.search(rf"#define QRL_POLICY_{side}_LSB (.*)", header)
+        values = re.search(rf"#define HOVER_{side}_LSB (.*)", header)
         assert values
         found = np.array([float(value.rstrip("Ff")) for value in values[1].split(",")], np.float32)
         np.testing.assert_array_equal(found, lsb.astype(np.float32))
@@ -198,8 +198,8 @@ def test_golden_vectors_replay(sizes: tuple[int, ...]) -> None:
     obs_i16, answers = (
         np.array([[int(cell) for cell in row[part]] for row in rows]) for part in (slice(n, 2 * n), slice(2 * n, None))
     )
-    status, action = reference.step(kernel, obs)
-    status_i16, action_i16 = reference.step_i16(kernel, obs_i16.astype(np.int16))
+    status, action = policies.step(kernel, obs)
+    status_i16, action_i16 = policies.step_i16(kernel, obs_i16.astype(np.int16))
     np.testing.assert_array_equal(answers[:, 0], status)
     np.testing.assert_array_equal(answers[:, 1], status_i16)
     np.testing.assert_array_equal(answers[:, 2:], action_i16)
@@ -215,14 +215,14 @@ def test_golden_vectors_replay(sizes: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("text", HOSTILE.values(), ids=HOSTILE.keys())
 def test_no_name_breaks_a_file(text: str, tmp_path: Path) -> None:
     policy = named(run=text, task=text, description=text, commit=text)
-    folder = policies.emitted(tmp_path, policy, policies.kernel(ODD))
+    folder = policies.emitted(tmp_path, policy, policies.kernel(ODD)).parent
     compiled(folder, *STRICT, "-c")
     compiled(folder, *STRICT, sources=(f"{EXAMPLE}/main.c", SOURCE), output="example")
     manifest = strict_json((folder / "manifest.json").read_text())
     assert (manifest["run"], manifest["task"], manifest["commit"]) == (text, text, text)
     library = strict_json((folder / "library.json").read_text())
     assert set(library) == set(strict_json(files(ODD)["library.json"]))
-    assert library["name"] == "qrl_policy"
+    assert library["name"] == "hover"
     properties, plain = ((folder / "library.properties").read_bytes(), files(ODD)["library.properties"].encode())
     keys = [[line.split(b"=")[0] for line in text.splitlines()] for text in (properties, plain)]
     assert keys[0] == keys[1]
@@ -232,7 +232,7 @@ def test_no_name_breaks_a_file(text: str, tmp_path: Path) -> None:
 def test_a_name_that_is_not_unicode_is_emitted(tmp_path: Path) -> None:
     """A folder's name may be any bytes; Python hands them on as lone surrogates."""
     policy = named(run=os.fsdecode(b"caf\xe9"))
-    compiled(policies.emitted(tmp_path, policy, policies.kernel(ODD)), *STRICT, "-c")
+    compiled(policies.emitted(tmp_path, policy, policies.kernel(ODD)).parent, *STRICT, "-c")
 
 
 # -- it builds -----------------------------------------------------------------------------------------------
@@ -244,7 +244,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[tuple[int, 
     return {
         (sizes, activation): policies.emitted(
             tmp_path_factory.mktemp("export"), policies.policy(sizes, activation), policies.kernel(sizes, activation)
-        )
+        ).parent
         for sizes in (HOVER, PENDULUM, ODD, FLAT)
         for activation in ("relu", "tanh")
     }
@@ -266,9 +266,7 @@ def test_it_needs_no_library_and_keeps_no_state(exported: Exported) -> None:
         compiled(folder, "-std=c99", "-O2", "-fno-stack-protector", "-c")
         symbols = [line.split()[-2:] for line in run("nm", "object.o", cwd=folder).splitlines()]
         assert {name for kind, name in symbols if kind == "T"} == {
-            "qrl_policy_step",
-            "qrl_policy_step_i16",
-            "qrl_policy_selftest",
+            *("hover_reset", "hover_step", "hover_step_i16", "hover_selftest"),
         }
         outside = {name for kind, name in symbols if kind == "U"}
         assert outside <= {"memset", "memcpy", "_GLOBAL_OFFSET_TABLE_"}
@@ -284,19 +282,19 @@ def test_the_example_builds_and_runs(exported: Exported, tmp_path: Path) -> None
         said = run("make", "-s", cwd=folder / EXAMPLE)
         names, values = said.strip().split(": ")
         assert names.split() == [port.name for port in policy.actions]
-        wanted = reference.step(kernel, vectors.golden(policy, kernel).obs[:1])[1][0]
+        wanted = policies.step(kernel, vectors.golden(policy, kernel).obs[:1])[1][0]
         np.testing.assert_allclose([float(value) for value in values.split()], wanted, atol=6e-5)
         run("make", "-s", "clean", cwd=folder / EXAMPLE)
-        assert {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()} <= policies.EMITTED | {
-            "object.o"
-        }
+        assert {
+            str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()
+        } <= policies.emitted_files() | {"object.o"}
 
 
 def test_the_example_says_when_its_self_test_fails(exported: Exported, tmp_path: Path) -> None:
     need([tool for tool in ("make", "cc") if not shutil.which(tool)])
     folder = shutil.copytree(exported[ODD, "relu"], tmp_path / "export")
     source = (folder / SOURCE).read_text()
-    (folder / SOURCE).write_text(source.replace("act_safe[QRL_POLICY_ACT_SIZE] = {", "act_safe[] = {1.0F +", 1))
+    (folder / SOURCE).write_text(source.replace("act_safe[HOVER_ACT_SIZE] = {", "act_safe[] = {1.0F +", 1))
     assert (folder / SOURCE).read_text() != source
     run("make", "-s", "policy", cwd=folder / EXAMPLE)
     run("./policy", cwd=folder / EXAMPLE)  # the self-test asks for the same safe action
@@ -324,17 +322,20 @@ def test_cpp_may_call_it(exported: Exported, tmp_path: Path) -> None:
     folder = shutil.copytree(exported[ODD, "relu"], tmp_path / "export")
     compiled(folder, "-std=c99", "-O2", "-c")
     (folder / "main.cpp").write_text(
-        '#include "qrl_policy.h"\n'
+        '#include "hover.h"\n'
         "int main() {\n"
-        "    static const float obs_lsb[] = {QRL_POLICY_OBS_LSB}, act_lsb[] = {QRL_POLICY_ACT_LSB};\n"
-        "    float obs[QRL_POLICY_OBS_SIZE] = {}, act[QRL_POLICY_ACT_SIZE];\n"
-        "    int16_t steps[QRL_POLICY_OBS_SIZE] = {}, act_steps[QRL_POLICY_ACT_SIZE];\n"
-        "    qrl_policy_step(obs, act);\n"
-        "    qrl_policy_step_i16(steps, act_steps);\n"
-        "    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {\n"
+        "    static const float obs_lsb[] = {HOVER_OBS_LSB}, act_lsb[] = {HOVER_ACT_LSB};\n"
+        "    float obs[HOVER_OBS_SIZE] = {}, act[HOVER_ACT_SIZE];\n"
+        "    int16_t steps[HOVER_OBS_SIZE] = {}, act_steps[HOVER_ACT_SIZE];\n"
+        "    hover_state state, state_i16;\n"
+        "    hover_reset(&state);\n"
+        "    hover_reset(&state_i16);\n"
+        "    hover_step(&state, obs, act);\n"
+        "    hover_step_i16(&state_i16, steps, act_steps);\n"
+        "    for (int i = 0; i < HOVER_ACT_SIZE; ++i) {\n"
         "        if (act[i] != static_cast<float>(act_steps[i]) * act_lsb[i]) return 2;\n"
         "    }\n"
-        "    return obs_lsb[QRL_POLICY_OBS_O4] > 0 ? qrl_policy_selftest() : 3;\n"
+        "    return obs_lsb[HOVER_OBS_O4] > 0 ? hover_selftest() : 3;\n"
         "}\n"
     )
     flags = ("-std=c++11", "-pedantic", "-Wall", "-Wextra", "-Werror")

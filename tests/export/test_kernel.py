@@ -88,7 +88,7 @@ def some(sizes: tuple[int, ...], activation: str, n: int, seed: int = 1) -> np.n
 @ACTIVATIONS
 def test_the_float_entry_is_the_literal_arithmetic(sizes: tuple[int, ...], activation: str) -> None:
     kernel, observations = policies.kernel(sizes, activation), some(sizes, activation, 40)
-    status, action = reference.step(kernel, observations)
+    status, action = policies.step(kernel, observations)
     for i, row in enumerate(observations.view(np.uint32).tolist()):
         wanted = literal_inputs(kernel, row)
         if wanted is None:
@@ -108,7 +108,7 @@ def test_the_float_entry_is_the_literal_arithmetic(sizes: tuple[int, ...], activ
 def test_the_fixed_point_entry_is_the_literal_arithmetic(sizes: tuple[int, ...], activation: str) -> None:
     kernel = policies.kernel(sizes, activation)
     observations = vectors.observations_i16(policies.policy(sizes, activation), kernel, 1000, 1)[::25]
-    status, action = reference.step_i16(kernel, observations)
+    status, action = policies.step_i16(kernel, observations)
     for i, row in enumerate(observations.tolist()):
         assert (status[i], action[i].tolist()) == literal(kernel, row)
     assert set(status) == {0, 1}
@@ -169,6 +169,7 @@ def layered(rng: np.random.Generator, sizes: tuple[int, ...], activation: str = 
         act_min=np.full(outputs, -INT16),
         act_max=np.full(outputs, INT16),
         act_safe=np.zeros(outputs, np.float32),
+        obs_shift=np.zeros(inputs, int),
     )
 
 
@@ -179,7 +180,7 @@ def test_any_integers_are_the_literal_arithmetic(activation: str, seed: int) -> 
     rng = np.random.default_rng(seed)
     kernel = layered(rng, (6, 9, 5, 3), activation)
     x = rng.integers(-INT16 - 1, INT16 + 1, (30, 6)).astype(np.int16)
-    status, action = reference.step_i16(kernel, x)
+    status, action = policies.step_i16(kernel, x)
     for i, row in enumerate(x.tolist()):
         assert (status[i], action[i].tolist()) == literal(kernel, row)
 

@@ -7,7 +7,6 @@ import pytest
 
 import policies
 from policies import FLAT, HOVER, ODD, PENDULUM
-from qrl.export import kernel as reference
 from qrl.export.kernel import INT16, AccumulatorOverflow, Kernel
 from qrl.export.policy import ACTIVATIONS, Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, si_layers
@@ -68,7 +67,7 @@ def rounded_to_nearest(policy: Policy, *, by_row: bool) -> np.ndarray:
 def test_integers_are_close_to_float(sizes: tuple[int, ...], activation: str) -> None:
     """Well within the bars, and clearly better than rounding to nearest."""
     policy, kernel = policies.policy(sizes, activation), policies.kernel(sizes, activation)
-    error = full_scales(policy, reference.step(kernel, policy.calibration)[1], policy.calibration)
+    error = full_scales(policy, policies.step(kernel, policy.calibration)[1], policy.calibration)
     assert rmse(error) <= 0.003
     assert np.abs(error).max() <= 0.025
     by_row, by_tensor = (
@@ -82,7 +81,7 @@ def test_integers_are_close_to_float(sizes: tuple[int, ...], activation: str) ->
 def test_integers_are_close_on_flights_not_calibrated_on(activation: str) -> None:
     policy, kernel = policies.policy(HOVER, activation), policies.kernel(HOVER, activation)
     observations = fresh(HOVER)
-    status, action = reference.step(kernel, observations)
+    status, action = policies.step(kernel, observations)
     within = status == 0
     assert within.mean() > 0.99
     error = full_scales(policy, action[within], observations[within])
@@ -98,7 +97,7 @@ def test_ranges_cover_the_flights(sizes: tuple[int, ...], activation: str) -> No
     assert (kernel.obs_min * kernel.lsb <= policy.calibration.min(axis=0)).all()
     reach = np.maximum(-kernel.obs_min, kernel.obs_max)
     assert ((reach >= 500) & (reach <= INT16)).all()
-    assert not reference.step(kernel, policy.calibration)[0].any()
+    assert not policies.step(kernel, policy.calibration)[0].any()
 
 
 def test_integers_fit_their_types() -> None:
@@ -134,7 +133,7 @@ def test_actions_stay_within_their_limits(sizes: tuple[int, ...], activation: st
     rng = np.random.default_rng(0)
     corners = np.where(rng.random((4000, sizes[0])) < 0.5, kernel.obs_min, kernel.obs_max) * kernel.lsb
     wild = (corners * rng.uniform(0, 2, (4000, 1))).astype(np.float32)
-    action = reference.step(kernel, wild)[1]
+    action = policies.step(kernel, wild)[1]
     low, high = policy.limits
     assert (action >= low - 0.5 * kernel.act_lsb).all()
     assert (action <= high + 0.5 * kernel.act_lsb).all()
@@ -147,7 +146,7 @@ def test_the_safe_action_is_the_answer_to_no_number() -> None:
     observations = fresh(HOVER)[:36].copy()
     for i in range(36):
         observations[i, i % 18] = (np.nan, -np.inf)[i // 18]
-    status, action = reference.step(kernel, observations)
+    status, action = policies.step(kernel, observations)
     assert (status == 2).all()
     np.testing.assert_allclose(action, 0.667 * 9.81 / 4, rtol=1e-3)
 
@@ -187,7 +186,7 @@ def test_no_flight_to_calibrate_on_is_refused(observations: np.ndarray) -> None:
 
 def assert_close(policy: Policy, worst: float = 0.05) -> None:
     kernel = quantize(policy)
-    error = full_scales(policy, reference.step(kernel, policy.calibration)[1], policy.calibration)
+    error = full_scales(policy, policies.step(kernel, policy.calibration)[1], policy.calibration)
     assert np.abs(error).max() <= worst
 
 

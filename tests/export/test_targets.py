@@ -13,36 +13,48 @@ import pytest
 from cross_targets import EACH, EITHER, M0, M3, M4F, M7, need
 from qrl.export import targets
 from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, VerificationFailed
-from qrl.export.vectors import Outputs
+from qrl.export.vectors import Observations, Outputs
 
 HEADER = """\
 #include <stdint.h>
-#define QRL_POLICY_OBS_SIZE {obs}
-#define QRL_POLICY_ACT_SIZE {act}
-int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]);
-int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]);
-int qrl_policy_selftest(void);
+#define SOUND_OBS_SIZE {obs}
+#define SOUND_ACT_SIZE {act}
+typedef struct {{
+    int16_t steps;
+    uint8_t sign;
+}} sound_state;
+void sound_reset(sound_state *state);
+int sound_step(sound_state *state, const float obs[SOUND_OBS_SIZE], float act[SOUND_ACT_SIZE]);
+int sound_step_i16(sound_state *state, const int16_t obs[SOUND_OBS_SIZE], int16_t act[SOUND_ACT_SIZE]);
+int sound_selftest(void);
 """
 # Copies, with statuses: float to float by bits, int16 to int16 after a loop of 2 * rounds instructions.
-# F32_STACK bytes of stack in one entry, I16_STACK in the other.
+# The state counts the steps since the last reset. F32_STACK bytes of stack in one entry, I16_STACK in the other.
 SOUND = """\
-#include "qrl_policy.h"
+#include "sound.h"
 #include <string.h>
 #define F32_STACK 1000
 #define I16_STACK 200
 
-int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE])
+void sound_reset(sound_state *state)
+{
+    state->steps = 0;
+    state->sign = 0;
+}
+
+int sound_step(sound_state *state, const float obs[SOUND_OBS_SIZE], float act[SOUND_ACT_SIZE])
 {
     volatile uint8_t touched[F32_STACK];
     for (int i = 0; i < F32_STACK; i++) {
         touched[i] = 0;
     }
-    memcpy(act, obs, sizeof(float) * QRL_POLICY_ACT_SIZE);
+    memcpy(act, obs, sizeof(float) * SOUND_ACT_SIZE);
+    state->steps++;
     /* end of f32 */
     return touched[0] + (obs[0] > 0.0f);
 }
 
-int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE])
+int sound_step_i16(sound_state *state, const int16_t obs[SOUND_OBS_SIZE], int16_t act[SOUND_ACT_SIZE])
 {
     volatile uint8_t touched[I16_STACK];
     for (int i = 0; i < I16_STACK; i++) {
@@ -52,12 +64,13 @@ int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_
     uint32_t rounds = (uint32_t)(obs[0] & 0xff) + 1u;
     __asm__ volatile(".syntax unified\\n1: subs %0, #1\\n bne 1b" : "+l"(rounds) : : "cc");
 #endif
-    memcpy(act, obs, sizeof(int16_t) * QRL_POLICY_ACT_SIZE);
+    memcpy(act, obs, sizeof(int16_t) * SOUND_ACT_SIZE);
+    state->steps++;
     /* end of i16 */
     return touched[0] + (obs[0] > 0 ? 2 : 0);
 }
 
-int qrl_policy_selftest(void)
+int sound_selftest(void)
 {
     /* selftest */
     return 0;
@@ -67,19 +80,21 @@ VECTORS = 301  # more than ten chunks, the last one partly filled
 RNG = np.random.default_rng(0)
 OBS_F32 = RNG.integers(0, 2**32, (VECTORS, 18), np.uint32).view(np.float32)  # any bits: infinities and NaN among them
 OBS_I16 = RNG.integers(-(2**15), 2**15, (VECTORS - 7, 18), np.int16)
+LENGTH = 20  # steps from one reset to the next
+GIVEN = Observations(OBS_F32, OBS_I16, LENGTH)
 ODD = 77  # the vector that faults wait for
 
 
 def write(folder: Path, *faults: tuple[str, str], obs: int = 18, act: int = 4) -> Path:
-    """The sound kernel, with each (old, new) replaced."""
+    """The sound kernel, with each (old, new) replaced; the path of its C."""
     source = SOUND
     for old, new in faults:
         assert old in source
         source = source.replace(old, new)
     folder.mkdir(exist_ok=True)
-    (folder / "qrl_policy.h").write_text(HEADER.format(obs=obs, act=act), encoding="utf-8")
-    (folder / "qrl_policy.c").write_text(source, encoding="utf-8")
-    return folder
+    (folder / "sound.h").write_text(HEADER.format(obs=obs, act=act), encoding="utf-8")
+    (folder / "sound.c").write_text(source, encoding="utf-8")
+    return folder / "sound.c"
 
 
 class Case(NamedTuple):
@@ -95,7 +110,7 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
     kernel = write(work / "kernel")
 
     def run(core: Core) -> Case:
-        return Case(*targets.run_core(core, kernel, work, RELEASE, OBS_F32, OBS_I16))
+        return Case(*targets.run_core(core, kernel, work, RELEASE, GIVEN))
 
     with ThreadPoolExecutor(len(CORES)) as pool:
         return dict(zip((core.name for core in CORES), pool.map(run, CORES), strict=True))
@@ -104,8 +119,8 @@ def cases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Case]:
 def on(core: Core | None, kernel: Path, work: Path) -> Outputs:
     """`kernel` on a core, or on the host where there is none."""
     if core is None:
-        return targets.run_host(kernel, work, RELEASE, OBS_F32, OBS_I16)
-    return targets.run_core(core, kernel, work, RELEASE, OBS_F32, OBS_I16)[0]
+        return targets.run_host(kernel, work, RELEASE, GIVEN)
+    return targets.run_core(core, kernel, work, RELEASE, GIVEN)[0]
 
 
 def bits(values: np.ndarray) -> np.ndarray:
@@ -116,6 +131,10 @@ def assert_sound(run: Outputs, *, statuses: bool = True) -> None:
     np.testing.assert_array_equal(bits(run.act), bits(OBS_F32[:, :4]))
     np.testing.assert_array_equal(run.act_i16, OBS_I16[:, :4])
     np.testing.assert_array_equal(run.status_i16, 2 * (OBS_I16[:, 0] > 0))
+    for state, n in ((run.state, len(OBS_F32)), (run.state_i16, len(OBS_I16))):
+        assert state.shape == (n, 4)
+        np.testing.assert_array_equal(np.ascontiguousarray(state[:, :2]).view("<i2")[:, 0], np.arange(n) % LENGTH + 1)
+        assert not state[:, 2].any()
     if statuses:
         np.testing.assert_array_equal(run.status, (OBS_F32[:, 0] > 0).astype(int))
     assert run.selftest == 0
@@ -131,7 +150,7 @@ def test_every_output_comes_back_from_a_core(core: Core, cases: dict[str, Case])
     "flags", [STRICT, FIRMWARE, (*RELEASE, "-fsanitize=address,undefined", "-fno-sanitize-recover")]
 )
 def test_every_output_comes_back_from_the_host(flags: tuple[str, ...], tmp_path: Path) -> None:
-    run = targets.run_host(write(tmp_path / "kernel"), tmp_path, flags, OBS_F32, OBS_I16)
+    run = targets.run_host(write(tmp_path / "kernel"), tmp_path, flags, GIVEN)
     assert_sound(run, statuses="-ffast-math" not in flags)  # where a comparison with NaN may say anything
 
 
@@ -140,9 +159,9 @@ def test_one_output_and_an_odd_layout(core: Core | None, tmp_path: Path) -> None
     kernel = write(tmp_path / "kernel", obs=3, act=1)
     obs_f32, obs_i16 = OBS_F32[:, :3], OBS_I16[:, 4:7]
     if core is None:
-        run = targets.run_host(kernel, tmp_path, RELEASE, obs_f32, obs_i16)
+        run = targets.run_host(kernel, tmp_path, RELEASE, Observations(obs_f32, obs_i16))
     else:
-        run = targets.run_core(core, kernel, tmp_path, FIRMWARE, obs_f32, obs_i16)[0]
+        run = targets.run_core(core, kernel, tmp_path, FIRMWARE, Observations(obs_f32, obs_i16))[0]
     np.testing.assert_array_equal(bits(run.act), bits(obs_f32[:, :1]))
     np.testing.assert_array_equal(run.act_i16, obs_i16[:, :1])
 
@@ -159,7 +178,7 @@ def test_one_lsb_shows(core: Core | None, tmp_path: Path) -> None:
 
 @EITHER
 def test_outputs_left_alone_show(core: Core | None, tmp_path: Path) -> None:
-    run = on(core, write(tmp_path / "kernel", ("* QRL_POLICY_ACT_SIZE", "* (QRL_POLICY_ACT_SIZE - 1)")), tmp_path)
+    run = on(core, write(tmp_path / "kernel", ("* SOUND_ACT_SIZE", "* (SOUND_ACT_SIZE - 1)")), tmp_path)
     assert set(bits(run.act)[:, 3]) == {0xA5A5A5A5}
     assert set(run.act_i16.view(np.uint16)[:, 3]) == {0xA5A5}
 
@@ -167,10 +186,25 @@ def test_outputs_left_alone_show(core: Core | None, tmp_path: Path) -> None:
 @EITHER
 @pytest.mark.parametrize("entry", ["f32", "i16"])
 def test_a_write_beyond_the_outputs_fails(entry: str, core: Core | None, tmp_path: Path) -> None:
-    beyond = f"volatile int four = QRL_POLICY_ACT_SIZE; if (obs[0] == obs[0]) {{ act[four] = 0; }} /* end of {entry} */"
+    beyond = f"volatile int four = SOUND_ACT_SIZE; if (obs[0] == obs[0]) {{ act[four] = 0; }} /* end of {entry} */"
     kernel = write(tmp_path / "kernel", (f"/* end of {entry} */", beyond))
     with pytest.raises(VerificationFailed, match=rf"{'step_i16' if entry == 'i16' else 'step'} writes past the end"):
         on(core, kernel, tmp_path)
+
+
+@EITHER
+@pytest.mark.parametrize("entry", ["f32", "i16"])
+def test_a_write_beyond_the_state_fails(entry: str, core: Core | None, tmp_path: Path) -> None:
+    beyond = f"volatile int one = 1; state[one].steps = 0; /* end of {entry} */"
+    kernel = write(tmp_path / "kernel", (f"/* end of {entry} */", beyond))
+    with pytest.raises(VerificationFailed, match=rf"{'step_i16' if entry == 'i16' else 'step'} writes past .*state"):
+        on(core, kernel, tmp_path)
+
+
+@EITHER
+def test_a_reset_that_leaves_something_out_shows(core: Core | None, tmp_path: Path) -> None:
+    run = on(core, write(tmp_path / "kernel", ("state->sign = 0;", "")), tmp_path)
+    assert set(run.state[:, 2]) == {0xA5}
 
 
 @EITHER
@@ -195,9 +229,8 @@ def test_the_selftests_answer_is_passed_on(core: Core | None, tmp_path: Path) ->
     assert on(core, write(tmp_path / "kernel", ("return 0;", "return -7;")), tmp_path).selftest == -7
 
 
-LINE = (
-    f"obs=18 act=4 vectors_f32={len(OBS_F32)} vectors_i16={len(OBS_I16)} selftest=0"  # all that the host's reader needs
-)
+# All that the host's reader needs.
+LINE = f"obs=18 act=4 state=4 vectors_f32={len(OBS_F32)} vectors_i16={len(OBS_I16)} selftest=0"
 
 
 @pytest.mark.usefixtures("host")
@@ -219,7 +252,7 @@ def test_an_end_that_is_not_the_harnesss_own_fails(selftest: str, words: str, tm
     heads = ("#include <string.h>", "#include <stdio.h>\n#include <stdlib.h>\n#include <string.h>\n#include <unistd.h>")
     kernel = write(tmp_path / "kernel", heads, ("/* selftest */", selftest))
     with pytest.raises(VerificationFailed, match=words):
-        targets.run_host(kernel, tmp_path, FIRMWARE, OBS_F32, OBS_I16)
+        targets.run_host(kernel, tmp_path, FIRMWARE, GIVEN)
 
 
 @pytest.mark.usefixtures("cross")
@@ -311,4 +344,4 @@ def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     monkeypatch.setenv("PATH", str(tmp_path))
     assert targets.missing_tools() == ["arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"]
     with pytest.raises(VerificationFailed, match="no C compiler"):
-        targets.run_host(tmp_path, tmp_path, RELEASE, OBS_F32, OBS_I16)
+        targets.run_host(tmp_path, tmp_path, RELEASE, GIVEN)

@@ -18,11 +18,10 @@ import pytest
 import policies
 from cross_targets import EACH, EITHER, M0, M4F, need
 from policies import FLAT, HOVER, ODD, PENDULUM
-from qrl.export import kernel as reference
 from qrl.export import targets, vectors
 from qrl.export.kernel import Dense, Kernel
 from qrl.export.targets import CORES, FIRMWARE, RELEASE, STRICT, Core, Counts, VerificationFailed
-from qrl.export.vectors import Outputs, Vectors
+from qrl.export.vectors import Observations, Outputs, Vectors
 from qrl.export.verify import compare, verify
 
 MANY, FEW = 10_000, 600
@@ -38,7 +37,7 @@ def expected(sizes: tuple[int, ...], activation: str, n: int) -> Vectors:
 
 @pytest.fixture(scope="module")
 def kernel_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[tuple[int, ...], str], Path]:
-    """The export folder of a policy of policies.py."""
+    """The emitted C of a policy of policies.py."""
 
     @cache
     def folder(sizes: tuple[int, ...], activation: str) -> Path:
@@ -56,6 +55,9 @@ def assert_same(found: Outputs, wanted: Outputs) -> None:
     np.testing.assert_array_equal(found.status, wanted.status)
     np.testing.assert_array_equal(found.status_i16, wanted.status_i16)
     np.testing.assert_array_equal(found.act_i16, wanted.act_i16)
+    for state, known in ((found.state, wanted.state), (found.state_i16, wanted.state_i16)):
+        np.testing.assert_array_equal(state[:, : known.shape[1]], known)
+        assert state.shape[1] - known.shape[1] < 4  # padding
     np.testing.assert_array_equal(np.ascontiguousarray(found.act).view(np.uint32), wanted.act.view(np.uint32))
     assert found.selftest == 0
 
@@ -112,7 +114,7 @@ def test_the_host_gives_the_references_bits(how: str, activation: str, kernel_of
     if how not in ("strict", "firmware", "-O0") and not builds(flags, tmp_path):
         pytest.skip(f"this compiler cannot do {' '.join(flags)}")
     wanted = expected(HOVER, activation, MANY)
-    found = targets.run_host(kernel_of(HOVER, activation), tmp_path, flags, wanted.obs, wanted.obs_i16)
+    found = targets.run_host(kernel_of(HOVER, activation), tmp_path, flags, wanted.observations)
     assert_same(found, wanted.outputs)
 
 
@@ -123,11 +125,11 @@ def test_odd_shapes_give_the_references_bits(
 ) -> None:
     """Sizes that are no multiple of four, one input layer alone, one output."""
     for activation in ("relu", "tanh"):
-        wanted, folder = expected(sizes, activation, FEW), kernel_of(sizes, activation)
+        wanted, source = expected(sizes, activation, FEW), kernel_of(sizes, activation)
         if core is None:
-            found = targets.run_host(folder, tmp_path, SANITIZED, wanted.obs, wanted.obs_i16)
+            found = targets.run_host(source, tmp_path, SANITIZED, wanted.observations)
         else:
-            found, _ = targets.run_core(core, folder, tmp_path, RELEASE, wanted.obs, wanted.obs_i16)
+            found, _ = targets.run_core(core, source, tmp_path, RELEASE, wanted.observations)
         assert_same(found, wanted.outputs)
 
 
@@ -144,9 +146,9 @@ def cases(kernel_of: KernelOf, tmp_path_factory: pytest.TempPathFactory) -> Case
 
     def run(case: tuple[str, Core]) -> tuple[Outputs, Counts, targets.Sizes]:
         activation, core = case
-        folder, wanted = kernel_of(HOVER, activation), expected(HOVER, activation, MANY)
-        outputs, counts = targets.run_core(core, folder, work, RELEASE, wanted.obs, wanted.obs_i16)
-        return outputs, counts, targets.size(core, folder, work)
+        source, wanted = kernel_of(HOVER, activation), expected(HOVER, activation, MANY)
+        outputs, counts = targets.run_core(core, source, work, RELEASE, wanted.observations)
+        return outputs, counts, targets.size(core, source, work)
 
     each = [(activation, core) for activation in ("relu", "tanh") for core in CORES]
     for activation in ("relu", "tanh"):  # before the threads: what is cached is made once
@@ -204,7 +206,7 @@ def test_the_assembly_bears_any_optimization(
     tmp_path: Path,
 ) -> None:
     wanted = expected(HOVER, activation, FEW)
-    found, _ = targets.run_core(core, kernel_of(HOVER, activation), tmp_path, flags, wanted.obs, wanted.obs_i16)
+    found, _ = targets.run_core(core, kernel_of(HOVER, activation), tmp_path, flags, wanted.observations)
     assert_same(found, wanted.outputs)
 
 
@@ -222,7 +224,7 @@ def test_the_assembly_bears_any_optimization(
 )
 def test_each_core_gets_its_body(cpu: str, instruction: str, kernel_of: KernelOf, tmp_path: Path) -> None:
     """And the strictest warnings hold for all three."""
-    source = kernel_of(HOVER, "tanh") / "qrl_policy.c"
+    source = kernel_of(HOVER, "tanh")
     command = ["arm-none-eabi-gcc", *STRICT, f"-mcpu={cpu}", "-mthumb", "-S", str(source), "-o", "kernel.s"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -237,8 +239,10 @@ def test_cppcheck_finds_nothing(kernel_of: KernelOf) -> None:
         # Members that only align, or that one body of three does not use.
         command = ["cppcheck", "--quiet", "--error-exitcode=3", "--std=c99"]
         command += ["--enable=warning,style,performance,portability", "--suppress=unusedStructMember"]
-        command += ["--suppress=missingIncludeSystem", "qrl_policy.c"]
-        done = subprocess.run(command, cwd=kernel_of(sizes, activation), capture_output=True, text=True, check=False)
+        command += ["--suppress=missingIncludeSystem", "hover.c"]
+        done = subprocess.run(
+            command, cwd=kernel_of(sizes, activation).parent, capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr
 
 
@@ -258,15 +262,15 @@ def test_bad_input_is_answered(core: Core | None, kernel_of: KernelOf, tmp_path:
     far[rows, rows] = 1.01 * np.where(rows % 2, kernel.obs_max, kernel.obs_min) * kernel.lsb
     obs, steps = np.concatenate([*each, far, good]), np.zeros((1, 18), np.int16)
     if core is None:
-        found = targets.run_host(kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, obs, steps)
+        found = targets.run_host(kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, Observations(obs, steps))
     else:
-        found, _ = targets.run_core(core, kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, obs, steps)
+        found, _ = targets.run_core(core, kernel_of(HOVER, "relu"), tmp_path, FIRMWARE, Observations(obs, steps))
     np.testing.assert_array_equal(found.status, np.repeat([2, 2, 2, 2, 1, 0], 18))
     np.testing.assert_allclose(found.act[:72], 0.667 * 9.81 / 4, rtol=1e-3)
     assert np.isfinite(found.act).all()
     saturated = good.copy()
     saturated[rows, rows] = np.where(rows % 2, kernel.obs_max, kernel.obs_min) * kernel.lsb
-    np.testing.assert_array_equal(found.act[72:90], reference.step(kernel, saturated)[1])
+    np.testing.assert_array_equal(found.act[72:90], policies.step(kernel, saturated)[1])
 
 
 # -- verification is able to fail -------------------------------------------------------------------------------
@@ -337,11 +341,11 @@ def test_one_step_of_a_difference_fails_verification(fault: Callable[[Kernel], K
     """Emitted from another kernel than the reference; its golden vectors do not reveal it."""
     policy, kernel = policies.policy(ODD), policies.kernel(ODD)
     other = fault(kernel)
-    folder = policies.emitted(tmp_path, policy, other)
+    source = policies.emitted(tmp_path, policy, other)
     wanted = expected(ODD, "relu", FEW)
-    found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
+    found = targets.run_host(source, tmp_path, ("-O0",), wanted.observations)
     assert found.selftest == 0
-    with pytest.raises(VerificationFailed, match=r"^here: .*qrl_policy_step.* differs from the reference in"):
+    with pytest.raises(VerificationFailed, match=r"^here: .*step.* differs from the reference in"):
         compare("here", found, wanted.outputs)
 
 
@@ -349,10 +353,10 @@ def test_one_step_of_a_difference_fails_verification(fault: Callable[[Kernel], K
 def test_the_verification_of_another_kernel_fails(tmp_path: Path) -> None:
     policy, kernel = policies.policy(ODD), policies.kernel(ODD)
     other = bumped(kernel, -1, "bias")
-    folder = policies.emitted(tmp_path, policy, other)
-    verify(policy, other, folder, FEW)
-    with pytest.raises(VerificationFailed, match=r"^host, -O2: qrl_policy_step differs from the reference in"):
-        verify(policy, kernel, folder, FEW)
+    source = policies.emitted(tmp_path, policy, other)
+    verify(policy, other, source, FEW)
+    with pytest.raises(VerificationFailed, match=r"^host, -O2: step differs from the reference in"):
+        verify(policy, kernel, source, FEW)
 
 
 SOURCE_FAULTS = {
@@ -371,12 +375,12 @@ def test_a_slip_in_the_source_shows(fault: tuple[str, str], tmp_path: Path) -> N
     policy, kernel = policies.policy(FLAT), policies.kernel(FLAT)
     narrow = kernel.layers[0]  # its outputs pass 16 bits now and then
     kernel = replace(kernel, layers=(replace(narrow, multiplier=narrow.multiplier, shift=max(narrow.shift - 3, 0)),))
-    folder = policies.emitted(tmp_path, policy, kernel)
-    source = (folder / "qrl_policy.c").read_text()
-    assert fault[0] in source
-    (folder / "qrl_policy.c").write_text(source.replace(*fault))
+    source = policies.emitted(tmp_path, policy, kernel)
+    text = source.read_text()
+    assert fault[0] in text
+    source.write_text(text.replace(*fault))
     wanted = vectors.draw(policy, kernel, FEW)
-    found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
+    found = targets.run_host(source, tmp_path, ("-O0",), wanted.observations)
     with pytest.raises(VerificationFailed, match="differs from the reference"):
         compare("here", found, wanted.outputs)
 
@@ -392,9 +396,9 @@ def test_the_self_test_reads_its_table(table: str, tmp_path: Path) -> None:
     values[1] = values[0] if part is golden else values[1] + 1
     part = part._replace(**{table: values})
     golden = part if isinstance(part, Vectors) else golden._replace(outputs=part)
-    folder = policies.emitted(tmp_path, policy, kernel, golden)
+    source = policies.emitted(tmp_path, policy, kernel, golden)
     wanted = expected(ODD, "relu", FEW)
-    found = targets.run_host(folder, tmp_path, ("-O0",), wanted.obs, wanted.obs_i16)
+    found = targets.run_host(source, tmp_path, ("-O0",), wanted.observations)
     assert found.selftest == 2
     with pytest.raises(VerificationFailed, match=r"here: the self-test failed \(2\)"):
         compare("here", found, wanted.outputs)
@@ -410,9 +414,9 @@ def test_a_difference_is_named() -> None:
             compare("M0", outputs._replace(**{name: wrong}), wanted)
     bit = wanted.act.copy()
     bit.view(np.int32)[9, 1] ^= 1
-    with pytest.raises(VerificationFailed, match=r"M0: qrl_policy_step differs .* in 1 places, first in vector 9"):
+    with pytest.raises(VerificationFailed, match=r"M0: step differs .* in 1 places, first in vector 9"):
         compare("M0", outputs._replace(act=bit), wanted)
-    with pytest.raises(VerificationFailed, match=r"M0: status of qrl_policy_step: expected .* values, found"):
+    with pytest.raises(VerificationFailed, match=r"M0: status of step: expected .* values, found"):
         compare("M0", outputs._replace(status=wanted.status[1:]), wanted)
     with pytest.raises(VerificationFailed, match=r"M0: the self-test failed \(-7\)"):
         compare("M0", outputs._replace(selftest=-7), wanted)

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from qrl.export import emit, vectors
+from qrl.export import kernel as reference
 from qrl.export.kernel import Kernel
-from qrl.export.policy import ACTIVATIONS, ActionSpec, ObservationSpec, Policy, Provenance
+from qrl.export.policy import ACTIVATIONS, ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
 from qrl.export.quantize import quantize
 from qrl.export.vectors import Vectors
 from qrl_envs import io_spec
@@ -25,19 +26,16 @@ PROVENANCE = Provenance(
 )
 HOVER, PENDULUM, ODD, FLAT = (18, 64, 64, 4), (3, 64, 64, 1), (5, 7, 3, 2), (18, 4)
 
-# What an export holds, but for its report.
-EMITTED = {
-    "examples/bare_metal/CMakeLists.txt",
-    "examples/bare_metal/Makefile",
-    "examples/bare_metal/main.c",
-    "examples/qrl_policy/qrl_policy.ino",
-    "golden.csv",
-    "library.json",
-    "library.properties",
-    "manifest.json",
-    "qrl_policy.c",
-    "qrl_policy.h",
-}
+NAME = "hover"  # of kernels, unless another is given
+
+
+def emitted_files(name: str = NAME) -> set[str]:
+    """What an export holds, but for its report."""
+    return {
+        *("examples/bare_metal/CMakeLists.txt", "examples/bare_metal/Makefile", "examples/bare_metal/main.c"),
+        *(f"examples/{name}/{name}.ino", "golden.csv", "library.json", "library.properties", "manifest.json"),
+        *(f"{name}.c", f"{name}.h"),
+    }
 
 
 def hover_flights(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -114,9 +112,57 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
     return replace(made, layers=(*rest, (weight, bias - middle)))
 
 
-def outputs(policy: Policy, observations: np.ndarray) -> np.ndarray:
+# Both kinds of memory, and each alone; an odd number of actions; positions of very different sizes and steps, clipped.
+REMEMBERING = {
+    "both": (HOVER, Memory(True, Integral((9, 10, 11), radius_m=1.0, limit_m_s=0.4))),
+    "action": (HOVER, Memory(True, None)),
+    "integral": (HOVER, Memory(False, Integral((9, 10, 11), radius_m=0.3, limit_m_s=0.05))),
+    "one action": (PENDULUM, Memory(True, Integral((2, 0, 1), radius_m=3.0, limit_m_s=1.0))),
+    "odd": (ODD, Memory(True, Integral((1, 4, 3), radius_m=25.0, limit_m_s=20.0))),
+}
+
+
+@cache
+def remembering(which: str = "both", activation: str = "relu") -> Policy:
+    """A lively policy with memory: each of its inputs moves the actions."""
+    sizes, memory = REMEMBERING[which]
+    base = policy(sizes, activation)
+    actions, n = len(base.actions), len(base.calibration)
+    rng = np.random.default_rng([7, *sizes])
+    columns, offset, gain = [base.calibration], [base.observation_offset], [base.observation_gain]
+    if memory.previous_action:
+        columns.append(rng.permutation(base.to_si(rng.uniform(-1.2, 1.2, (n, actions)))))
+        offset.append(base.offset)
+        gain.append(1.0 / base.scale)
+    if memory.integral:
+        columns.append(memory.integral.limit_m_s * rng.uniform(-1.0, 1.0, (n, 3)) ** 3)
+        offset.append(np.zeros(3))
+        gain.append(np.full(3, 2.0 / memory.integral.limit_m_s))
+    (weight, bias), *hidden, (last, last_bias) = base.layers
+    more = rng.normal(size=(memory.size(actions), weight.shape[1])) * 0.5 * (2.0 / len(weight)) ** 0.5
+    made = replace(
+        base,
+        memory=memory,
+        observation_offset=np.concatenate(offset),
+        observation_gain=np.concatenate(gain),
+        observation_scale=np.concatenate([base.observation_scale, rng.uniform(0.5, 1.0, memory.size(actions))]),
+        layers=((np.concatenate([weight, more]), bias), *hidden, (last, last_bias)),
+        calibration=np.concatenate(columns, axis=1).astype(np.float32),
+    )
+    a = outputs(made, made.calibration)
+    last, middle = 0.7 * last / a.std(axis=0), 0.7 * (a - last_bias).mean(axis=0) / a.std(axis=0)
+    return replace(made, layers=(*made.layers[:-1], (last, last_bias - middle)))
+
+
+@cache
+def remembering_kernel(which: str = "both", activation: str = "relu") -> Kernel:
+    """`remembering` of the same arguments, quantized once for all tests."""
+    return quantize(remembering(which, activation))
+
+
+def outputs(policy: Policy, inputs: np.ndarray) -> np.ndarray:
     """The network's own outputs [n, A], written apart from Policy."""
-    x = (observations.astype(np.float64) - policy.observation_offset) * policy.observation_gain
+    x = (inputs.astype(np.float64) - policy.observation_offset) * policy.observation_gain
     x = np.minimum(np.maximum(x, -policy.observation_clip), policy.observation_clip) * policy.observation_scale
     for i, (weight, bias) in enumerate(policy.layers):
         x = np.einsum("ni,io->no", x, weight) + bias
@@ -131,10 +177,20 @@ def kernel(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
     return quantize(policy(sizes, activation, seed))
 
 
-def emitted(folder: Path, policy: Policy, kernel: Kernel, golden: Vectors | None = None) -> Path:
-    """All that is emitted but the report, written to `folder`."""
-    for name, text in emit.files(policy, kernel, golden or vectors.golden(policy, kernel)).items():
-        path = folder / name
+def step(kernel: Kernel, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Status and action of the reference's float entry, from a reset."""
+    return reference.step(kernel, reference.initial_state(kernel, len(observation)), observation)[1:]
+
+
+def step_i16(kernel: Kernel, observation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Status and action of the reference's fixed-point entry, from a reset."""
+    return reference.step_i16(kernel, reference.initial_state(kernel, len(observation)), observation)[1:]
+
+
+def emitted(folder: Path, policy: Policy, kernel: Kernel, golden: Vectors | None = None, name: str = NAME) -> Path:
+    """All that is emitted but the report, written to `folder`; the path of the kernel's C."""
+    for file, text in emit.files(policy, kernel, golden or vectors.golden(policy, kernel), name).items():
+        path = folder / file
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")
-    return folder
+    return folder / f"{name}.c"

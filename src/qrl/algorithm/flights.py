@@ -1,7 +1,7 @@
 """Deterministic flights from many starts, and what they measure."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -29,30 +29,44 @@ def fly(
     max_episode_steps: int,
     reset: Callable[[Env, chex.PRNGKey], State] = lambda env, keys: jax.vmap(env.reset)(keys),
 ) -> Flights:
-    """Fly one start for each key under the deterministic action clip(mean(observation), −1, 1).
+    """As `fly_with_memory`, under a policy without memory: mean(observation)."""
+    return fly_with_memory(env, lambda memory, o: (memory, mean(o)), (), keys, max_episode_steps, reset)
 
+
+def fly_with_memory(
+    env: Env,
+    policy: Callable[[Any, chex.Array], tuple[Any, chex.Array]],
+    memory: Any,
+    keys: chex.PRNGKey,
+    max_episode_steps: int,
+    reset: Callable[[Env, chex.PRNGKey], State] = lambda env, keys: jax.vmap(env.reset)(keys),
+) -> Flights:
+    """Fly one start for each key under policy(memory, observation) -> next memory, action, which is clipped to [−1, 1].
+
+    `memory`, for all starts, is that of the first step.
     An environment with an `evaluation` is flown and measured as that says, another for one episode of
     `max_episode_steps`. `reset` draws the starts. What is recorded and measured is `info["true_obs"]`, if present,
-    while the policy sees the observation. A flight that ends early has no more observations: its NaNs make it a failure.
-    Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better for it.
+    while the policy sees the observation. A flight that ends early has no more observations: its NaNs make it a
+    failure. Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better for it.
     """
     plan = adapt(env).evaluation()
     measure = plan.measure if plan else None
     env, steps, return_steps = (plan.env, plan.steps, plan.return_steps) if plan else (env, *[max_episode_steps] * 2)
 
     def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
-        state, total = carry
-        action = jnp.clip(mean(state.obs), -1.0, 1.0)
+        state, total, memory = carry
+        memory, action = policy(memory, state.obs)
+        action = jnp.clip(action, -1.0, 1.0)
         after = jax.vmap(env.step)(state, action)
         over = state.done.astype(bool)
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
         terminated = over & ~info_flag(state, "out_of_bounds")
         total = total + jnp.where(terminated | (t >= return_steps), 0.0, held.reward)
-        return (held, total), (_observed(state), action)
+        return (held, total, memory), (_observed(state), action)
 
     state = reset(env, keys)
-    first = state, jnp.zeros(keys.shape[0])
-    (state, returns), (observations, actions) = jax.lax.scan(step, first, jnp.arange(steps))
+    first = state, jnp.zeros(keys.shape[0]), memory
+    (state, returns, _), (observations, actions) = jax.lax.scan(step, first, jnp.arange(steps))
     observations = jnp.concatenate([observations, _observed(state)[None]]).swapaxes(0, 1)
     measures = jax.vmap(measure)(observations) if measure else {}
     return Flights(returns, ~state.done.astype(bool), measures, observations, actions.swapaxes(0, 1))

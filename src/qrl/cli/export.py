@@ -4,23 +4,25 @@ import argparse
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import NDArray
 
+from qrl import tasks
 from qrl.algorithm.flights import Flights, summarize
 from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
-from qrl.evaluation.trained_run import TrainedRun
+from qrl.evaluation.trained_run import TrainedRun, flown_inputs
 from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
-from qrl.export.kernel import Kernel
+from qrl.export.kernel import Ints, Kernel
 from qrl.export.policy import Policy
-from qrl.export.quantize import UnsupportedNetwork, quantize
+from qrl.export.quantize import UnsupportedNetwork, quantize, respond
 from qrl.export.report import FlightStats, Measured, gates, report
 from qrl.export.verify import VerificationReport, verify
 from qrl_envs.specfile import BadInput
@@ -30,33 +32,48 @@ def export(args: argparse.Namespace) -> int:
     """Write RUN/export; print verification, gates and costs."""
     start_time = time.perf_counter()
     run = TrainedRun.load(args.run)
-    measured = export_run(run, args.starts, args.vectors, console.print)
+    name = kernel_name(run, args.name)
+    measured = export_run(run, args.starts, args.vectors, console.print, name)
     verification = measured.verification
-    for name in verification.passed:
-        console.print(f"verified bit-exact ({verification.vectors:,} vectors per entry point): {name}")
+    for target in verification.passed:
+        console.print(f"verified bit-exact ({verification.vectors:,} vectors per entry point): {target}")
     for line in verification.skipped:
         console.print(f"skipped {line}")
     for gate in gates(measured):
         console.print(f"{gate} {'ok' if gate.passed else 'FAILED'}")
     if verification.costs:
-        heads = f"{'float entry':>12} {'i16 entry':>10} {'flash':>8} {'stack':>7}"
+        heads = f"{'float entry':>12} {'i16 entry':>10} {'flash':>8} {'stack':>7} {'state':>6}"
         console.print(f"{'instructions per inference':<27} {heads}")
     for cost in verification.costs:
         mean, mean_i16 = cost.step[0], cost.step_i16[0]
-        console.print(
-            f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {cost.flash:>6,} B {max(cost.stack):>5} B"
-        )
+        memory = f"{cost.flash:>6,} B {max(cost.stack):>5} B {cost.state:>4} B"
+        console.print(f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {memory}")
     duration = clock(time.perf_counter() - start_time)
-    console.print(f"done in {duration}: {run.folder / 'export'}/qrl_policy.c, .h, report.md")
+    console.print(f"done in {duration}: {run.folder / 'export'}/{name}.c, .h, report.md")
     return DONE
 
 
-def export_run(run: TrainedRun, starts: int, vectors_per_entry: int, log: Callable[[str], None]) -> Measured:
+def kernel_name(run: TrainedRun, name: str | None) -> str:
+    """The prefix of all names in C: `name`, by default `qrl_` and the task's name. BadInput if it cannot be one."""
+    if name is None:
+        return emit.default_name(tasks.folder_name(run.config.task))
+    if not emit.is_name(name):
+        raise BadInput(
+            f"--name '{name}': expected a C identifier of at most {emit.MAX_NAME} characters that is no header of the"
+            " C library, such as hover"
+        )
+    return name
+
+
+def export_run(
+    run: TrainedRun, starts: int, vectors_per_entry: int, log: Callable[[str], None], name: str | None = None
+) -> Measured:
     """Quantize, emit, verify and fly the policy of `run`, and replace its folder `export` atomically.
 
     Raises BadInput for a network that the kernel cannot represent, AccumulatorOverflow and VerificationFailed; the
-    previous `export` is then unchanged.
+    previous `export` is then unchanged. `name`: as `kernel_name` takes it.
     """
+    name = kernel_name(run, name)
     log("flying to calibrate")
     policy = run.policy()
     try:
@@ -66,11 +83,11 @@ def export_run(run: TrainedRun, starts: int, vectors_per_entry: int, log: Callab
     target = run.folder / "export"
     with TemporaryDirectory(dir=run.folder, prefix=".export-") as scratch, ThreadPoolExecutor(1) as pool:
         folder = Path(scratch) / "export"
-        _write(folder, emit.files(policy, kernel, vectors.golden(policy, kernel)))
+        _write(folder, emit.files(policy, kernel, vectors.golden(policy, kernel), name))
         log("compiling and verifying; flying")
-        verification = pool.submit(verify, policy, kernel, folder, vectors_per_entry)
+        verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)
-        _write(folder, {"report.md": report(policy, kernel, measured)})
+        _write(folder, {"report.md": report(policy, kernel, measured, name)})
         previous = Path(scratch) / "previous"
         if target.exists():
             target.replace(previous)
@@ -95,21 +112,24 @@ def _measured(
 ) -> Measured:
     """Fly both policies from the starts of an evaluation, then wait for the verification."""
 
-    def integer(observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        return reference.step(kernel, observation)[1]
+    def integer(state: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
+        """The kernel has the measured observation only, and keeps its own memory."""
+        after, _, action = reference.step(kernel, state.astype(np.int64), observation[:, :measured])
+        return after, action
 
+    measured = len(policy.observations)
     keys = evaluation_starts(starts)
     float_flights = run.fly(keys)
-    integer_flights = run.fly_host_policy(integer, keys)
+    integer_flights = run.fly_host_policy(integer, reference.initial_state(kernel, starts), keys)
     # Every step of the transient, where the errors are; the observations of a settled vehicle repeat.
-    observations = np.asarray(float_flights.observations[:, :-1])
+    inputs = flown_inputs(policy, float_flights)
     transient = 2 * calibration.TRANSIENT_STEPS
-    parts = observations[:, :transient], observations[:, transient::4]
+    parts = inputs[:, :transient], inputs[:, transient::4]
     flown = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts])
     flown = flown[np.isfinite(flown).all(axis=1)]
     tail = run.tail_steps()
     return Measured(
-        accuracy=accuracy(policy, integer, flown),
+        accuracy=accuracy(policy, partial(respond, kernel), flown),
         float_flights=_stats(policy, float_flights, tail),
         integer_flights=_stats(policy, integer_flights, tail),
         verification=verification(),

@@ -101,6 +101,8 @@ def build_parser() -> _Parser:
     evaluate.add_argument("--checkpoints", type=count, default=1, metavar="K", help=recent)
     each = "test vectors per entry point (default 2000, at least 500)"
     export.add_argument("--vectors", type=vectors, default=2000, metavar="N", help=each)
+    name = "prefix of all names in the C code (default qrl_TASK)"
+    export.add_argument("--name", metavar="NAME", help=name)
     chosen = "indices among evaluate's 1,000 starts (default: eight, failed ones first)"
     view.add_argument("--starts", type=whole_number, nargs="+", metavar="N", help=chosen)
     view.add_argument("--out", type=Path, metavar="FILE", help="HTML file (default RUN/view.html)")

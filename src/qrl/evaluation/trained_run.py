@@ -1,6 +1,6 @@
 """A trained run: load a checkpoint, fly its policy in any environment, and get it as a value to export."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -23,12 +23,17 @@ from qrl.algorithm.types import Env, State
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import calibration_starts
-from qrl.export.accuracy import PolicyFn
-from qrl.export.policy import ActionSpec, ObservationSpec, Policy, Provenance
+from qrl.export.policy import ActionSpec, Memory, ObservationSpec, Policy, Provenance
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
+from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput
+from qrl_envs.task import QuadrotorTask, Task
+from qrl_envs.vehicle import shipped_vehicles
+
+HostStep = Callable[[NDArray[np.integer], NDArray[np.float32]], tuple[NDArray[Any], NDArray[np.floating]]]
+"""Memory [n, S] and observation [n, I] of n flights -> next memory, and action [n, A] in SI units."""
 
 
 class TrainedRun:
@@ -77,33 +82,39 @@ class TrainedRun:
         """Deterministic flights of the float policy in NumPy, leading axis: starts; `env`: by default the run's own."""
         return self._programs.fly(self._learner, env or self.env, starts)
 
-    def fly_host_policy(self, policy_fn: PolicyFn, starts: chex.PRNGKey, from_envelope: float = 0.0) -> Flights:
+    def fly_host_policy(
+        self, step: HostStep, memory: NDArray[np.integer], starts: chex.PRNGKey, from_envelope: float = 0.0
+    ) -> Flights:
         """Flights of a NumPy policy in the run's environment; a fraction `from_envelope` starts in the envelope.
 
-        Compiled once; the policy runs on the host (`jax.pure_callback`).
+        `memory` [starts, S] is that of the first step. Compiled once for each size of it; the policy runs on the host
+        (`jax.pure_callback`).
         """
         _, actions = self._specs()
         offset, scale = (np.array([getattr(action, name) for action in actions]) for name in ("offset", "scale"))
 
-        def normalized(observation: NDArray[np.float32]) -> NDArray[np.float32]:
-            return ((policy_fn(np.asarray(observation)) - offset) / scale).astype(np.float32)
+        def normalized(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Any, Any]:
+            memory, action = step(np.asarray(memory), np.asarray(observation))
+            return memory.astype(np.int32), ((action - offset) / scale).astype(np.float32)
 
         self._host_policy = normalized
         in_envelope = jnp.arange(len(starts)) >= (1.0 - from_envelope) * len(starts)
-        return jax.tree.map(np.asarray, self._fly_host(starts, in_envelope))
+        return jax.tree.map(np.asarray, self._fly_host(memory.astype(np.int32), starts, in_envelope))
 
-    def _host_flights(self, starts: chex.PRNGKey, in_envelope: chex.Array) -> Flights:
-        def mean(observation: chex.Array) -> chex.Array:
-            shape = jax.ShapeDtypeStruct((*observation.shape[:-1], self.env.action_size), jnp.float32)
-            return jax.pure_callback(lambda o: self._host_policy(o), shape, observation)
+    def _host_flights(self, memory: chex.Array, starts: chex.PRNGKey, in_envelope: chex.Array) -> Flights:
+        def policy(memory: chex.Array, observation: chex.Array) -> tuple[chex.Array, chex.Array]:
+            action = jax.ShapeDtypeStruct((*observation.shape[:-1], self.env.action_size), jnp.float32)
+            shapes = jax.ShapeDtypeStruct(memory.shape, jnp.int32), action
+            return jax.pure_callback(lambda m, o: self._host_policy(m, o), shapes, memory, observation)
 
         def reset(env: Env, in_envelope: chex.Array, key: chex.PRNGKey) -> State:
             states = adapt(env).reset_calibration(key), env.reset(key)
             return jax.tree.map(partial(jnp.where, in_envelope), *states)
 
-        return flights.fly(
+        return flights.fly_with_memory(
             self.env,
-            mean,
+            policy,
+            memory,
             starts,
             self.max_episode_steps,
             lambda env, keys: jax.vmap(partial(reset, env))(in_envelope, keys),
@@ -113,25 +124,43 @@ class TrainedRun:
         """The deployed policy's mean action as a pure JAX function; [..., F] -> [..., A]."""
         return self._programs.policy_mean(self._learner, observation)
 
-    def policy(self) -> Policy:
-        """The policy to deploy, calibrated on observations of its own flights. BadInput without a control period."""
-        policy = self.float_policy()
-        starts = calibration_starts(calibration.STARTS)
-        flown = self.fly_host_policy(policy, starts, from_envelope=calibration.FROM_ENVELOPE)
-        return replace(policy, calibration=calibration.select(np.asarray(flown.observations[:, :-1])))
+    def policy(self, memory: Memory | None = None) -> Policy:
+        """The policy to deploy, calibrated on observations of its own flights. BadInput without a control period.
 
-    def float_policy(self) -> Policy:
-        """The policy as a value in SI units, without observations to calibrate on."""
+        `memory`: as `float_policy` takes it.
+        """
+        policy = self.float_policy(memory)
+
+        def step(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[NDArray[np.integer], Any]:
+            return memory, policy(inputs_in_si(policy, observation))  # the environment keeps the memory
+
+        starts = calibration_starts(calibration.STARTS)
+        none = np.zeros((len(starts), 0), np.int32)
+        flown = self.fly_host_policy(step, none, starts, from_envelope=calibration.FROM_ENVELOPE)
+        return replace(policy, calibration=calibration.select(flown_inputs(policy, flown)))
+
+    def float_policy(self, memory: Memory | None = None) -> Policy:
+        """The policy as a value in SI units, without observations to calibrate on.
+
+        With `memory`, by default the task's, the environment's observation is the measured one [F], then what `Memory`
+        says in its order: the previous action a [A] in [−1, 1], the integral [3] in m·s; then what the policy does not
+        see, if anything.
+        """
+        memory = memory or self._memory()
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
         layers = deployed.params.policy["params"]
-        size = len(deployed.statistics.mean)
+        size = len(layers["Dense_0"]["kernel"])  # of what the policy sees
         normalize = config.normalize_observations
         observations, actions = self._specs()
+        mean = np.asarray(deployed.statistics.mean)[:size] if normalize else np.zeros(size)
+        gain = 1.0 / np.asarray(std(deployed.statistics))[:size] if normalize else np.ones(size)
+        offset_si, scale_si = _units(actions, size, memory)
         return Policy(
             provenance=Provenance(
                 run=self.folder.resolve().name,
                 task=self.config.task.name,
                 description=self.task.description if self.task else "an environment without a task file",
+                vehicle=vehicle_name(self.task),
                 commit=self.config.versions.get("commit", "unknown"),
                 seed=self.config.seed,
                 env_steps=self.env_steps,
@@ -139,13 +168,14 @@ class TrainedRun:
             control_period_s=self._control_period_s(),
             observations=observations,
             actions=actions,
-            observation_offset=np.asarray(deployed.statistics.mean) if normalize else np.zeros(size),
-            observation_gain=1.0 / np.asarray(std(deployed.statistics)) if normalize else np.ones(size),
+            observation_offset=offset_si + scale_si * mean,
+            observation_gain=gain / scale_si,
             observation_clip=MAX_NORMALIZED if normalize else np.inf,
-            observation_scale=np.asarray(config.observation_scale or np.ones(size)),
+            observation_scale=np.asarray(config.observation_scale or np.ones(size))[:size],
             layers=tuple((layers[f"Dense_{i}"]["kernel"], layers[f"Dense_{i}"]["bias"]) for i in range(len(layers))),
             activation=config.activation,
             calibration=np.zeros((0, size), np.float32),
+            memory=memory,
         )
 
     def tail_steps(self) -> int:
@@ -153,6 +183,10 @@ class TrainedRun:
         if self.task is None:
             return self.max_episode_steps // 4
         return round(self.task.evaluation.tail_s / self.task.control_period_s)
+
+    def _memory(self) -> Memory | None:
+        """The memory that the task gives its policy; none does yet."""
+        return None
 
     def _control_period_s(self) -> float:
         period = self.task.control_period_s if self.task else adapt(self.env).control_period_s
@@ -173,3 +207,47 @@ class TrainedRun:
             tuple(ObservationSpec(f"o{i}", "?", frame) for i in range(sizes[0])),
             tuple(replace(action, name=f"a{i}") for i in range(sizes[1])),
         )
+
+
+def vehicle_name(task: Task | None) -> str | None:
+    """The name of the shipped vehicle that the task flies; None if it flies another, or none."""
+    if not isinstance(task, QuadrotorTask):
+        return None
+    shipped = {name: task_spec.load("hover", name) for name in shipped_vehicles()}
+    return next((name for name, hover in shipped.items() if getattr(hover, "vehicle", None) == task.vehicle), None)
+
+
+def inputs_in_si(policy: Policy, observation: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The policy's inputs [..., I] in SI units, of the environment's observation, which begins with them."""
+    size = len(policy.observation_scale)
+    offset, scale = _units(policy.actions, size, policy.memory)
+    return offset + scale * observation[..., :size]
+
+
+def flown_inputs(policy: Policy, flights: Flights) -> NDArray[np.float32]:
+    """The policy's inputs [n, steps, I] in SI units at each step of its flights, NaN from where one ended early.
+
+    A flight's observations are the measured ones; what the policy remembered follows from them and the actions.
+    """
+    measured = np.asarray(flights.observations)[:, :-1, : len(policy.observations)]
+    parts = [measured]
+    if policy.memory and policy.memory.previous_action:
+        actions = policy.to_si(np.asarray(flights.actions))
+        first = policy.initial_memory(len(actions))[:, None, : actions.shape[-1]]
+        parts.append(np.concatenate([first, actions[:, :-1]], axis=1))
+    if policy.memory and policy.memory.integral:
+        totals = [np.zeros((len(measured), 3))]
+        for observation in measured.swapaxes(0, 1):
+            totals.append(policy.integrated(totals[-1], observation))
+        parts.append(np.stack(totals[1:], axis=1))
+    return np.concatenate(parts, axis=-1).astype(np.float32)
+
+
+def _units(actions: tuple[ActionSpec, ...], size: int, memory: Memory | None) -> tuple[Any, Any]:
+    """Offset and scale [I] from the environment's observation to SI units: those of the action for the previous one."""
+    offset, scale = np.zeros(size), np.ones(size)
+    if memory and memory.previous_action:
+        first = size - memory.size(len(actions))
+        at = slice(first, first + len(actions))
+        offset[at], scale[at] = [port.offset for port in actions], [port.scale for port in actions]
+    return offset, scale

@@ -12,30 +12,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from qrl.export import kernel as reference
-from qrl.export.kernel import Dense, Kernel
+from qrl.export.kernel import Dense, Integral, Ints, Kernel, Memory
 from qrl.export.policy import Policy
-from qrl.export.vectors import EMBEDDED, Vectors
+from qrl.export.vectors import Vectors, embedded
 
-FORMAT = 1
+FORMAT = 2
 TEMPLATES = Path(__file__).parent / "templates"
 FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"
 
 
-def files(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
-    """All emitted files except the report: path in the export folder -> text."""
-    values = _values(policy, kernel, golden)
+MAX_NAME = 64
+# A header of this name would be found in place of the C library's.
+RESERVED = {
+    *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
+    *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),
+    *("wchar", "wctype"),
+}
+
+
+def is_name(name: str) -> bool:
+    """Whether it can prefix the symbols of a kernel: a C identifier, and no header of the C library."""
+    valid = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) and len(name) <= MAX_NAME
+    return bool(valid) and name.lower() not in RESERVED
+
+
+def default_name(task: str) -> str:
+    """`qrl_` and the task's name, with '_' for what a C identifier cannot have."""
+    return f"qrl_{re.sub(r'[^A-Za-z0-9_]', '_', task)}"[:MAX_NAME]
+
+
+def files(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[str, str]:
+    """All emitted files except the report: path in the export folder -> text. `name`: as `is_name` wants it."""
+    values = _values(policy, kernel, golden, name)
     templates = {str(path.relative_to(TEMPLATES)): path for path in TEMPLATES.rglob("*") if path.is_file()}
     emitted = {
-        name: re.sub(r"@(\w+)@", lambda match: values[match[1]], path.read_text(encoding="utf-8"))
-        for name, path in templates.items()
+        path.replace("NAME", name): re.sub(r"@(\w+)@", lambda match: values[match[1]], file.read_text(encoding="utf-8"))
+        for path, file in templates.items()
     }
-    emitted["manifest.json"] = json.dumps(manifest(policy, kernel), indent=2) + "\n"
-    emitted["golden.csv"] = _golden_csv(policy, golden)
+    emitted["manifest.json"] = json.dumps(manifest(policy, kernel, name), indent=2) + "\n"
+    emitted["golden.csv"] = _golden_csv(policy, kernel, golden)
     return emitted
 
 
-def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
-    """manifest.json: ports with names, units, frames, ranges and steps, and where the policy comes from."""
+def state_bytes(kernel: Kernel) -> int:
+    """sizeof(NAME_state)."""
+    if kernel.memory is None:
+        return 1
+    action = 0 if kernel.memory.initial_action is None else 2 * len(kernel.memory.initial_action)
+    return -(-(12 + action) // 4) * 4 if kernel.memory.integral else action
+
+
+def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
+    """manifest.json: ports with names, units, frames, ranges and steps, memory, and where the policy comes from."""
     run = policy.provenance
     obs = [
         {"name": o.name, "unit": o.unit, "frame": o.frame, "range": limits, "steps": [int(low), int(high)], "lsb": lsb}
@@ -50,17 +78,40 @@ def manifest(policy: Policy, kernel: Kernel) -> dict[str, Any]:
         act.append(port | {"safe": float(np.float32(a.safe))})
     return {
         "format": FORMAT,
+        "name": name,
         "task": run.task,
+        "vehicle": run.vehicle,
         "run": run.run,
         "commit": run.commit,
         "seed": run.seed,
         "env_steps": run.env_steps,
         "control_period_s": policy.control_period_s,
+        "state_bytes": state_bytes(kernel),
+        "memory": _memory(policy, kernel),
         "network": kernel.widths,
         "activation": kernel.activation,
         "obs": obs,
         "act": act,
     }
+
+
+def _memory(policy: Policy, kernel: Kernel) -> dict[str, Any] | None:
+    """What the state holds: the previous action and the integral of the position, each null if it does not."""
+    if policy.memory is None or kernel.memory is None:
+        return None
+    found: dict[str, Any] = {"previous_action": None, "integral": None}
+    if kernel.memory.initial_action is not None:
+        first = (kernel.memory.initial_action * kernel.act_lsb.astype(np.float64)).tolist()
+        found["previous_action"] = {"after_reset": first}
+    if policy.memory.integral and kernel.memory.integral:
+        found["integral"] = {
+            "of": [policy.observations[i].name for i in policy.memory.integral.position],
+            "unit": "m s",
+            "radius_m": policy.memory.integral.radius_m,
+            "limit_m_s": policy.memory.integral.limit_m_s,
+            "lsb": kernel.memory.integral.unit_m_s,
+        }
+    return found
 
 
 def _obs_ranges(kernel: Kernel) -> list[list[float]]:
@@ -71,7 +122,7 @@ def _act_ranges(kernel: Kernel) -> list[list[float]]:
     return (np.stack([kernel.act_min, kernel.act_max], axis=1) * kernel.act_lsb[:, None].astype(float)).tolist()
 
 
-def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
+def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[str, str]:
     """Values of the templates' @placeholders@."""
     run, network = policy.provenance, "-".join(map(str, kernel.widths))
     banner = [
@@ -79,7 +130,18 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
         f" * A policy trained by qrl, exported as an integer network {network} ({kernel.activation}).",
         f" * Run {run.run}, seed {run.seed}, {run.env_steps:,} environment steps, commit {run.commit}.",
     ]
+    fields, meaning = _state(kernel)
+    size = state_bytes(kernel)
     return {
+        "name": name,
+        "NAME": name.upper(),
+        "state_is": meaning,
+        "state_fields": fields,
+        "state_bytes": f"{size} byte{'' if size == 1 else 's'}",
+        "state_size": str(size),
+        "previous_action": str(int(kernel.memory is not None and kernel.memory.initial_action is not None)),
+        "integral": str(int(kernel.memory is not None and kernel.memory.integral is not None)),
+        "inputs": str(kernel.widths[0]),
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(run.task),
         "ports": "\n".join(f" * {_comment_safe(line)}".rstrip() for line in _port_lines(policy, kernel)),
@@ -90,7 +152,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
         "obs_size": str(len(policy.observations)),
         "act_size": str(len(policy.actions)),
         "places": ",\n".join(
-            f"    QRL_POLICY_{kind}_{port.name.upper()} = {i}"
+            f"    {name.upper()}_{kind}_{port.name.upper()} = {i}"
             for kind, ports in (("OBS", policy.observations), ("ACT", policy.actions))
             for i, port in enumerate(ports)
         ),
@@ -103,8 +165,25 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors) -> dict[str, str]:
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
         "widest": str(max(map(_padded, kernel.widths))),
         "tanh": str(int(kernel.activation == "tanh")),
-        "tables": _tables(kernel, golden),
+        "tables": _tables(kernel, golden, name.upper()),
     }
+
+
+def _state(kernel: Kernel) -> tuple[str, str]:
+    """The fields of NAME_state, and what they hold in words."""
+    if kernel.memory is None:
+        return (
+            "    uint8_t unused; /* C has no empty structures */",
+            "none; the functions are those of policies that have one",
+        )
+    fields, words = [], []
+    if integral := kernel.memory.integral:
+        fields.append(f"    int32_t integral[3]; /* of the position, in {integral.unit_m_s:.4g} m s */")
+        words.append("the integral of the position")
+    if (first := kernel.memory.initial_action) is not None:
+        fields.append(f"    int16_t previous_action[{len(first)}]; /* in steps of lsb */")
+        words.append("the previous action")
+    return "\n".join(fields), " and ".join(words)
 
 
 def _comment_safe(text: str) -> str:
@@ -122,8 +201,9 @@ def _port_lines(policy: Policy, kernel: Kernel) -> Iterable[str]:
     yield f"act  {heading}"
     turns = {None: "", 1: ", spin +1: reaction torque positive about body z", -1: ", spin -1: negative"}
     for i, (a, (low, high), lsb) in enumerate(zip(policy.actions, _act_ranges(kernel), kernel.act_lsb, strict=True)):
-        place = a.position_m and f"; motor at x {a.position_m[0]:+g} m, y {a.position_m[1]:+g} m of the body"
-        meaning = f"{a.frame}{place or ''}{turns[a.spin]}; safe {a.safe:.4g}"
+        axes = ", ".join(f"{axis} {x:+g} m" for axis, x in zip("xyz", a.position_m or (), strict=False))
+        place = axes and f"; motor at {axes} of the body"
+        meaning = f"{a.frame}{place}{turns[a.spin]}; safe {a.safe:.4g}"
         yield f"{i:>3}  {a.name:<11} {a.unit:<7} {low:>9.4g} .. {high:<9.4g} {float(lsb):<10.4g} {meaning}"
 
 
@@ -134,20 +214,24 @@ def _padded(n: int) -> int:
     return -(-n // 4) * 4
 
 
-def _tables(kernel: Kernel, golden: Vectors) -> str:
+def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
     sizes = list(map(_padded, kernel.widths))
     columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max
     inputs = (f"{{{s}u, {e}, {low}, {high}}}" for s, e, low, high in zip(*columns, strict=True))
     parts = [
-        f"#define LAYERS {len(kernel.layers)}\n#define PADDED_OBS_SIZE {sizes[0]}\n#define GOLDENS {EMBEDDED}",
-        _array("struct input inputs[QRL_POLICY_OBS_SIZE]", inputs, 6),
-        _array("float act_lsb[QRL_POLICY_ACT_SIZE]", map(_float, kernel.act_lsb), 4),
-        _array("float act_safe[QRL_POLICY_ACT_SIZE]", map(_float, kernel.act_safe), 4),
-        _array("int16_t act_least[QRL_POLICY_ACT_SIZE]", kernel.act_min, 12),
-        _array("int16_t act_most[QRL_POLICY_ACT_SIZE]", kernel.act_max, 12),
+        f"#define LAYERS {len(kernel.layers)}\n#define PADDED_INPUTS {sizes[0]}\n#define GOLDENS {embedded(kernel)}",
+        _array(f"struct input inputs[{prefix}_OBS_SIZE]", inputs, 6),
+        _array(f"float act_lsb[{prefix}_ACT_SIZE]", map(_float, kernel.act_lsb), 4),
+        _array(f"float act_safe[{prefix}_ACT_SIZE]", map(_float, kernel.act_safe), 4),
+        _array(f"int16_t act_least[{prefix}_ACT_SIZE]", kernel.act_min, 12),
+        _array(f"int16_t act_most[{prefix}_ACT_SIZE]", kernel.act_max, 12),
     ]
     if kernel.activation == "tanh":
         parts.append(_array("int16_t tanh_table[257]", reference.tanh_table(), 16))
+    if memory := kernel.memory:
+        parts += _memory_tables(memory, prefix)
+        if memory.integral:
+            parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
     parts += [_layer_tables(i, layer) for i, layer in enumerate(kernel.layers)]
     rows = (
         f"{{weights_{i}.w, biases_{i}, factors_{i}, {sizes[i]}, {sizes[i + 1]},"
@@ -155,8 +239,30 @@ def _tables(kernel: Kernel, golden: Vectors) -> str:
         for i, layer in enumerate(kernel.layers)
     )
     parts.append(_array("struct layer layers[LAYERS]", rows, 1))
-    parts.append(_array("struct golden goldens[GOLDENS]", _golden_rows(golden), 1))
+    parts.append(_array("struct golden goldens[GOLDENS]", _golden_rows(golden, embedded(kernel)), 1))
     return "\n\n".join(parts)
+
+
+def _memory_tables(memory: Memory, prefix: str) -> list[str]:
+    kept = (f"{{{s}, {low}, {high}}}" for s, low, high in zip(memory.shift, memory.low, memory.high, strict=True))
+    parts = [_array(f"struct kept kept[INPUTS - {prefix}_OBS_SIZE]", kept, 8)]
+    if memory.initial_action is not None:
+        parts.append(_array(f"int16_t act_first[{prefix}_ACT_SIZE]", memory.initial_action, 12))
+    return parts
+
+
+def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, goldens: int) -> list[str]:
+    """`golden`: its states are at the end of the embedded vectors."""
+    columns = integral.inverse_radius, integral.gain, integral.inverse_radius_shift, integral.gain_shift
+    axes = (
+        f"{{{at}, {obs_shift[at]}, {', '.join(map(str, numbers))}}}"
+        for at, *numbers in zip(integral.position, *columns, strict=True)
+    )
+    return [
+        f"#define INTEGRAL_LIMIT {integral.limit}",
+        _array("struct axis axes[3]", axes, 1),
+        _array("int32_t golden_integral[3]", _integrals(golden)[goldens - 1], 3),
+    ]
 
 
 def _layer_tables(index: int, layer: Dense) -> str:
@@ -177,8 +283,13 @@ def _layer_tables(index: int, layer: Dense) -> str:
     )
 
 
-def _golden_rows(golden: Vectors) -> Iterable[str]:
-    for i in range(EMBEDDED):
+def _integrals(golden: Vectors) -> Ints:
+    """The integral after each vector, the state's first field; [n, 3]."""
+    return np.ascontiguousarray(golden.outputs.state[:, :12]).view("<i4")
+
+
+def _golden_rows(golden: Vectors, n: int) -> Iterable[str]:
+    for i in range(n):
         obs_i16, act = (", ".join(map(str, x[i])) for x in (golden.obs_i16, golden.outputs.act_i16))
         columns = f"{{{_floats(golden.obs[i])}}}", f"{{{obs_i16}}}", f"{{{act}}}"
         yield f"{{{', '.join(columns)}, {golden.outputs.status[i]}, {golden.outputs.status_i16[i]}}}"
@@ -202,15 +313,20 @@ def _floats(values: NDArray[np.float32]) -> str:
     return ", ".join(map(_float, values))
 
 
-def _golden_csv(policy: Policy, golden: Vectors) -> str:
-    """One row per vector: obs in SI units, obs in steps, status of each entry point, act in steps."""
+def _golden_csv(policy: Policy, kernel: Kernel, golden: Vectors) -> str:
+    """One row per vector: obs in SI units, obs in steps, status of each entry point, act in steps, and the integral.
+
+    Of a policy with memory they are one sequence, from a reset on.
+    """
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     names = [port.name for port in policy.observations]
     acts = [f"{port.name}_lsb" for port in policy.actions]
-    writer.writerow([*names, *(f"{name}_lsb" for name in names), "status", "status_i16", *acts])
+    kept = [f"integral_{axis}" for axis in "xyz"] if kernel.memory and kernel.memory.integral else []
+    writer.writerow([*names, *(f"{name}_lsb" for name in names), "status", "status_i16", *acts, *kept])
     outputs = golden.outputs
-    columns = golden.obs, golden.obs_i16, outputs.status, outputs.status_i16, outputs.act_i16
-    for obs, obs_i16, status, status_i16, act_i16 in zip(*columns, strict=True):
-        writer.writerow([*map(str, obs), *obs_i16, status, status_i16, *act_i16])
+    integrals = _integrals(golden) if kept else np.zeros((len(golden.obs), 0))
+    columns = golden.obs, golden.obs_i16, outputs.status, outputs.status_i16, outputs.act_i16, integrals
+    for obs, obs_i16, status, status_i16, act_i16, integral in zip(*columns, strict=True):
+        writer.writerow([*map(str, obs), *obs_i16, status, status_i16, *act_i16, *integral])
     return out.getvalue()

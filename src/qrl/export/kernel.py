@@ -22,8 +22,42 @@ class Dense:
 
 
 @dataclass(frozen=True, eq=False)
+class Integral:
+    """I += ⌊p·gate·gain / 2^(16 + gain_shift)⌉ per component, within ±limit, in units of `unit_m_s`.
+
+    p [3]: position in steps of the observation's lsb. With v = ⌊p·inverse_radius / 2^inverse_radius_shift⌉, which is
+    p/radius in 1/2¹⁵, and w = max(0, 2³⁰ − |v|²) / 2¹⁵, gate = w² / 2¹⁵, both rounded down. ⌊⌉: half is rounded up.
+    """
+
+    position: tuple[int, int, int]  # indices into the observation
+    inverse_radius: Ints  # [3] in [2¹⁴, 2¹⁵)
+    inverse_radius_shift: Ints  # [3] in [1, 30]
+    gain: Ints  # [3] in [0, 2¹⁵)
+    gain_shift: Ints  # [3] in [1, 30]
+    limit: int  # below 2³⁰
+    unit_m_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """The network's inputs [M] after the observation, from the state: the previous action, then the integral.
+
+    An input is ⌊value / 2^shift⌉ of the state's integer, saturated at low and high.
+    """
+
+    initial_action: Ints | None  # [A] after a reset, in steps of act_lsb; None: the previous action is no input
+    integral: Integral | None
+    shift: Ints  # [M] in [0, 30]
+    low: Ints  # [M]
+    high: Ints  # [M]
+
+
+@dataclass(frozen=True, eq=False)
 class Kernel:
-    """Observation i is x_i·lsb_i with 1/lsb_i = scale_i·2^(142 − exponent_i); action j is y_j·act_lsb_j."""
+    """Observation i is x_i·lsb_i with 1/lsb_i = scale_i·2^(142 − exponent_i); action j is y_j·act_lsb_j.
+
+    The network's input i is ⌊x_i / 2^obs_shift_i⌉: a position that is integrated has finer steps than its input.
+    """
 
     scale: Ints  # [F] in [2¹⁵, 2¹⁶)
     exponent: Ints  # [F]
@@ -35,6 +69,8 @@ class Kernel:
     act_min: Ints  # [A]
     act_max: Ints  # [A]
     act_safe: NDArray[np.float32]  # [A] in SI units
+    obs_shift: Ints  # [F] in [0, 15]; 0 but for a position that is integrated
+    memory: Memory | None = None
 
     @property
     def lsb(self) -> NDArray[np.float64]:
@@ -42,9 +78,27 @@ class Kernel:
         return 2.0 ** (self.exponent - 142) / self.scale
 
     @property
+    def memory_steps(self) -> NDArray[np.float64]:
+        """The step of each of the memory's inputs, in N or m·s; [M]."""
+        if self.memory is None:
+            return np.zeros(0)
+        parts = [] if self.memory.initial_action is None else [self.act_lsb.astype(np.float64)]
+        if self.memory.integral:
+            parts.append(np.full(3, self.memory.integral.unit_m_s))
+        return np.concatenate(parts) * 2.0**self.memory.shift
+
+    @property
+    def input_limits(self) -> tuple[Ints, Ints]:
+        """Smallest and largest of each of the network's inputs; [F + M]."""
+        low, high = (shifted(limit, self.obs_shift) for limit in (self.obs_min, self.obs_max))
+        if self.memory is None:
+            return low, high
+        return np.concatenate([low, self.memory.low]), np.concatenate([high, self.memory.high])
+
+    @property
     def widths(self) -> list[int]:
-        """Numbers of observations, of each hidden layer's units and of actions."""
-        return [len(self.scale), *(len(layer.bias) for layer in self.layers)]
+        """Numbers of the network's inputs, of each hidden layer's units and of actions."""
+        return [self.layers[0].weight.shape[1], *(len(layer.bias) for layer in self.layers)]
 
 
 class AccumulatorOverflow(ArithmeticError):
@@ -52,9 +106,10 @@ class AccumulatorOverflow(ArithmeticError):
 
 
 def accumulator_bound(kernel: Kernel) -> int:
-    """Upper bound of |accumulator| over all observations; AccumulatorOverflow if it is 2³¹ or more."""
+    """Upper bound of |accumulator| over all observations and states; AccumulatorOverflow if it is 2³¹ or more."""
     _check_fields(kernel)
-    largest, size = 0, np.maximum(-kernel.obs_min, kernel.obs_max)
+    low, high = kernel.input_limits
+    largest, size = 0, np.maximum(np.abs(low), np.abs(high))
     for i, layer in enumerate(kernel.layers):
         bounds = np.abs(layer.weight) @ size + np.abs(layer.bias)
         row = int(np.argmax(bounds))
@@ -65,13 +120,29 @@ def accumulator_bound(kernel: Kernel) -> int:
 
 
 def _check_fields(kernel: Kernel) -> None:
-    ranges = [
+    ranges: list[tuple[str, Ints, Ints | int, Ints | int]] = [
         ("an input's scale", kernel.scale, 2**15, 2**16 - 1),
         ("an input's exponent", kernel.exponent, -(2**15), INT16),
         ("an input's range", kernel.obs_min, -INT16, 0),
         ("an input's range", kernel.obs_max, 0, INT16),
+        ("an input's shift", kernel.obs_shift, 0, 15),
         ("an action's range", np.concatenate([kernel.act_min, kernel.act_max]), -INT16, INT16),
     ]
+    if memory := kernel.memory:
+        ranges += [
+            ("an input's shift", memory.shift, 0, 30),
+            ("an input's range", np.concatenate([memory.low, memory.high]), -INT16, INT16),
+        ]
+        if memory.initial_action is not None:
+            ranges.append(("the first action", memory.initial_action, kernel.act_min, kernel.act_max))
+        if integral := memory.integral:
+            ranges += [
+                ("the integral's radius", integral.inverse_radius, 2**14, INT16),
+                ("the integral's radius", integral.inverse_radius_shift, 1, 30),
+                ("the integral's gain", integral.gain, 0, INT16),
+                ("the integral's gain", integral.gain_shift, 1, 30),
+                ("the integral's limit", np.array(integral.limit), 1, 2**30 - 1),
+            ]
     for layer in kernel.layers:
         ranges += [
             ("a weight", layer.weight, -127, 127),
@@ -80,7 +151,7 @@ def _check_fields(kernel: Kernel) -> None:
             ("a shift", np.array(layer.shift), 0, 15),
         ]
     for name, values, low, high in ranges:
-        if values.min() < low or values.max() > high:
+        if np.any(values < low) or np.any(values > high):
             raise AccumulatorOverflow(f"{name} is outside [{low}, {high}]")
 
 
@@ -115,7 +186,7 @@ def hidden(layer: Dense, activation: str, x: Ints) -> Ints:
 
 
 def network(kernel: Kernel, x: Ints) -> Ints:
-    """Actions [n, A], in steps of act_lsb, for saturated observations x [n, F]."""
+    """Actions [n, A], in steps of act_lsb, for inputs x [n, F + M]."""
     for layer in kernel.layers[:-1]:
         x = hidden(layer, kernel.activation, x)
     return np.clip(dense(kernel.layers[-1], x, -INT16 - 1), kernel.act_min, kernel.act_max)
@@ -126,17 +197,69 @@ def _tanh(z: Ints) -> Ints:
     return table[at] + ((table[at + 1] - table[at]) * part + 128 >> 8)
 
 
-def step_i16(kernel: Kernel, observation: NDArray[np.int16]) -> tuple[Ints, NDArray[np.int16]]:
-    """Status [n] and action [n, A] for observations [n, F], in steps of the lsb: qrl_policy_step_i16."""
+def shifted(x: Ints, shift: Ints | int) -> Ints:
+    """x / 2^shift, rounded; half is rounded up."""
+    return x + (1 << np.asarray(shift) >> 1) >> shift
+
+
+def initial_state(kernel: Kernel, n: int) -> Ints:
+    """State [n, S] after a reset: the previous action [A], if it is an input, then the integral [3], if there is one.
+
+    A policy without memory has no columns.
+    """
+    if kernel.memory is None:
+        return np.zeros((n, 0), np.int64)
+    first, integral = kernel.memory.initial_action, kernel.memory.integral
+    parts = [np.zeros(0, np.int64) if first is None else first, np.zeros(3 if integral else 0, np.int64)]
+    return np.tile(np.concatenate(parts), (n, 1))
+
+
+def integrated(integral: Integral, total: Ints, position: Ints) -> Ints:
+    """The next integral [n, 3] of positions [n, 3] in steps."""
+    v = shifted(position * integral.inverse_radius, integral.inverse_radius_shift)
+    w = np.maximum(2**30 - np.minimum(v * v, 2**30).sum(axis=-1, keepdims=True), 0) >> 15
+    gate = w * w >> 15
+    more = shifted(position * gate * integral.gain >> 16, integral.gain_shift)
+    return np.clip(total + more, -integral.limit, integral.limit)
+
+
+def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
+    """The network's inputs [n, F + M] for the state [n, S] and saturated observations x [n, F]."""
+    measured = shifted(x, kernel.obs_shift)
+    if kernel.memory is None:
+        return measured
+    kept = np.clip(shifted(state, kernel.memory.shift), kernel.memory.low, kernel.memory.high)
+    return np.concatenate([measured, kept], axis=-1)
+
+
+def _act(kernel: Kernel, state: Ints, x: Ints) -> tuple[Ints, Ints]:
+    """Next state and action [n, A] in steps of act_lsb, for saturated observations x [n, F]."""
+    if kernel.memory and (integral := kernel.memory.integral):
+        total = integrated(integral, state[:, -3:], x[:, list(integral.position)])
+        state = np.concatenate([state[:, :-3], total], axis=-1)
+    action = network(kernel, inputs(kernel, state, x))
+    if kernel.memory and kernel.memory.initial_action is not None:
+        state = np.concatenate([action, state[:, action.shape[-1] :]], axis=-1)
+    return state, action
+
+
+def step_i16(kernel: Kernel, state: Ints, observation: NDArray[np.int16]) -> tuple[Ints, Ints, NDArray[np.int16]]:
+    """Next state [n, S], status [n] and action [n, A] for observations [n, F], in steps of the lsb: NAME_step_i16."""
     unclipped = observation.astype(np.int64)
     x = np.clip(unclipped, kernel.obs_min, kernel.obs_max)
-    return np.any(x != unclipped, axis=-1).astype(np.int64), network(kernel, x).astype(np.int16)
+    state, action = _act(kernel, state, x)
+    return state, np.any(x != unclipped, axis=-1).astype(np.int64), action.astype(np.int16)
 
 
-def step(kernel: Kernel, observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
-    """Status [n] and action [n, A] for observations [n, F], in SI units: qrl_policy_step."""
+def step(kernel: Kernel, state: Ints, observation: NDArray[np.float32]) -> tuple[Ints, Ints, NDArray[np.float32]]:
+    """Next state [n, S], status [n] and action [n, A] for observations [n, F], in SI units: NAME_step."""
     unclipped, finite = quantized(kernel, observation)
     x = np.clip(unclipped, kernel.obs_min, kernel.obs_max)
-    action = network(kernel, x).astype(np.float32) * kernel.act_lsb
+    after, action = _act(kernel, state, x)
     status = np.where(finite, np.any(x != unclipped, axis=-1), 2)
-    return status, np.where(finite[:, None], action, kernel.act_safe)
+    finite = finite[:, None]
+    return (
+        np.where(finite, after, state),
+        status,
+        np.where(finite, action.astype(np.float32) * kernel.act_lsb, kernel.act_safe),
+    )

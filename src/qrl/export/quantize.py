@@ -11,11 +11,14 @@ Four measures keep int8 weights close to the float policy:
   information).
 """
 
+from dataclasses import astuple, replace
+
 import numpy as np
 from numpy.typing import NDArray
 
+from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
-from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden, step
+from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
 from qrl.export.policy import ACTIVATIONS, Layer, Policy
 
 Floats = NDArray[np.float64]
@@ -28,6 +31,7 @@ MIN_INPUT = 1e-3  # an input that is zero throughout calibration may move later
 MIN_RANGE = 0.05  # of an activation, relative to its layer's largest: a unit inactive in calibration may activate later
 RIDGES = (0.01, 0.03, 0.3)  # pull of the fitted weights towards the float ones, in the order tried
 GOOD_ENOUGH = 0.03  # maximum action error on the calibration, as a fraction of full scale, that ends the trials
+INTEGRAL_BITS = 15  # by which the integral's unit is finer, at most, than the finest step of its input
 UNITS = np.linspace(1.0, 1.4, 24)  # relative weight steps tried per row: the error depends erratically on the step
 FIT_SAMPLES = 8_192
 MIN_SENSITIVITY = 0.05  # of a sample, relative to the mean: the action may be sensitive to the unit elsewhere
@@ -48,7 +52,7 @@ def quantize(policy: Policy) -> Kernel:
     best, smallest = None, np.inf
     for ridge in RIDGES:
         kernel = _quantized(policy, ridge)
-        error = accuracy(policy, lambda observations, k=kernel: step(k, observations)[1], policy.calibration).maximum
+        error = accuracy(policy, lambda inputs, k=kernel: respond(k, inputs), policy.calibration).maximum
         if best is None or error < smallest:
             best, smallest = kernel, error
         if smallest <= GOOD_ENOUGH:
@@ -62,21 +66,47 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     clip = policy.observation_clip / policy.observation_gain
     floor, ceiling = policy.observation_offset - clip, policy.observation_offset + clip
     x_float = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
-    largest = np.abs(x_float).max(axis=0)
-    obs_range = RANGE_MARGIN * np.where(largest > 0.0, largest, MIN_INPUT)
-    scale, exponent = _as_scale(_steps(obs_range, layers[0][0], MIN_LEVELS))
-    step = 2.0 ** (exponent - 142) / scale
-    most = np.minimum(np.floor(obs_range / step), INT16)
-    obs_min = np.clip(np.round(floor / step), -most, 0).astype(np.int64)
-    obs_max = np.clip(np.round(ceiling / step), 0, most).astype(np.int64)
+    measured = len(policy.observations)
+    largest = np.abs(x_float[:, :measured]).max(axis=0)
     low, high = policy.limits
     act_lsb = (np.maximum(np.abs(low), np.abs(high)) / INT16).astype(np.float32)
+    act_min, act_max = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
+    ranges = np.concatenate(
+        [RANGE_MARGIN * np.where(largest > 0.0, largest, MIN_INPUT), _memory_lsb(policy, act_lsb) * INT16]
+    )
+    wanted = _steps(ranges, layers[0][0], MIN_LEVELS)
+    # What is integrated or remembered has the finest step; a coarser one of the network's input is a shift.
+    shift = np.floor(np.log2(wanted / (ranges / INT16)) + 1e-9).astype(np.int64)
+    integral = policy.memory and policy.memory.integral
+    shifts = np.isin(np.arange(len(ranges)), integral.position if integral else ()) | (
+        np.arange(len(ranges)) >= measured
+    )
+    shift = np.where(shifts, shift, 0)
+    scale, exponent = _as_scale(np.where(shifts, ranges / INT16, wanted)[:measured])
+    lsb = 2.0 ** (exponent - 142) / scale
+    most = np.minimum(np.floor(ranges[:measured] / lsb), INT16)
+    step = np.concatenate([lsb, ranges[measured:] / INT16]) * 2.0**shift
+    kernel = Kernel(
+        scale=scale,
+        exponent=exponent,
+        obs_min=np.clip(np.round(floor[:measured] / lsb), -most, 0).astype(np.int64),
+        obs_max=np.clip(np.round(ceiling[:measured] / lsb), 0, most).astype(np.int64),
+        layers=(),
+        activation=policy.activation,
+        act_lsb=act_lsb,
+        act_min=act_min,
+        act_max=act_max,
+        act_safe=np.array([action.safe for action in policy.actions], np.float32),
+        obs_shift=shift[:measured],
+    )
+    if policy.memory:
+        kernel = replace(kernel, memory=_memory(policy, kernel, shift[measured:], floor[measured:], ceiling[measured:]))
 
     subset = slice(None, None, max(1, len(x_float) // FIT_SAMPLES))
-    ranges = _activation_ranges(layers, policy.activation, x_float)
+    activation_ranges = _activation_ranges(layers, policy.activation, x_float)
     x_float = x_float[subset]
     sensitivity = _sensitivity(policy, layers, x_float)
-    x = np.clip(np.round(x_float / step), obs_min, obs_max).astype(np.int64)
+    x = np.clip(np.round(x_float / step), *kernel.input_limits).astype(np.int64)
     dense: list[Dense] = []
     for i, (weight, bias) in enumerate(layers):
         target = x_float @ weight + bias
@@ -84,7 +114,7 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
         if last:
             out = act_lsb.astype(np.float64)
         elif policy.activation == "relu":
-            out = _steps(ranges[i], layers[i + 1][0], MIN_LEVELS)
+            out = _steps(activation_ranges[i], layers[i + 1][0], MIN_LEVELS)
         else:
             out = np.full(len(bias), TANH_RANGE / (INT16 + 1))
         dense.append(_dense(weight * step[:, None], target, x, sensitivity[i], out, ridge))
@@ -94,21 +124,85 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
         x_float = ACTIVATIONS[policy.activation](target)
         step = out if policy.activation == "relu" else np.full(len(bias), 1.0 / INT16)
 
-    act_min, act_max = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
-    kernel = Kernel(
-        scale=scale,
-        exponent=exponent,
-        obs_min=obs_min,
-        obs_max=obs_max,
-        layers=tuple(dense),
-        activation=policy.activation,
-        act_lsb=act_lsb,
-        act_min=act_min,
-        act_max=act_max,
-        act_safe=np.array([action.safe for action in policy.actions], np.float32),
-    )
+    kernel = replace(kernel, layers=tuple(dense))
     accumulator_bound(kernel)
     return kernel
+
+
+def respond(kernel: Kernel, x: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Actions [n, A] of the kernel for the network's inputs [n, I] in SI units."""
+    measured = len(kernel.scale)
+    unclipped, _ = integers.quantized(kernel, x[:, :measured].astype(np.float32))
+    q = integers.shifted(np.clip(unclipped, kernel.obs_min, kernel.obs_max), kernel.obs_shift)
+    if kernel.memory:
+        kept = np.round(x[:, measured:] / kernel.memory_steps)
+        q = np.concatenate([q, np.clip(kept, kernel.memory.low, kernel.memory.high).astype(np.int64)], axis=-1)
+    return integers.network(kernel, q).astype(np.float32) * kernel.act_lsb
+
+
+def _memory_lsb(policy: Policy, act_lsb: NDArray[np.float32]) -> Floats:
+    """The finest steps [M] of the memory's inputs: an action's own, and limit / 32767 of the integral."""
+    memory = policy.memory
+    if memory is None:
+        return np.zeros(0)
+    action = act_lsb.astype(np.float64) if memory.previous_action else np.zeros(0)
+    return np.concatenate([action, np.full(3, memory.integral.limit_m_s / INT16) if memory.integral else np.zeros(0)])
+
+
+def _memory(policy: Policy, kernel: Kernel, shift: Ints, floor: Floats, ceiling: Floats) -> integers.Memory:
+    """The memory's integers. Its inputs have steps of the finest·2^shift and are clipped at floor and ceiling; [M]."""
+    assert policy.memory
+    actions = len(kernel.act_lsb) if policy.memory.previous_action else 0
+    integral, bits = _integral(policy, kernel.lsb) if policy.memory.integral else (None, 0)
+    full = np.full(len(shift) - actions, INT16)
+    low = integers.shifted(np.concatenate([kernel.act_min[:actions], -full]), shift)
+    high = integers.shifted(np.concatenate([kernel.act_max[:actions], full]), shift)
+    step = _memory_lsb(policy, kernel.act_lsb) * 2.0**shift
+    first = np.round(policy.to_si(np.zeros(len(kernel.act_lsb))) / kernel.act_lsb.astype(np.float64))
+    return integers.Memory(
+        initial_action=np.clip(first, kernel.act_min, kernel.act_max).astype(np.int64) if actions else None,
+        integral=integral,
+        shift=shift + np.where(np.arange(len(shift)) < actions, 0, bits),
+        low=np.clip(np.round(floor / step), low, high).astype(np.int64),
+        high=np.clip(np.round(ceiling / step), low, high).astype(np.int64),
+    )
+
+
+def _integral(policy: Policy, lsb: Floats) -> tuple[integers.Integral, int]:
+    """The integral in integers, and by how many bits its unit is finer than limit / 32767."""
+    assert policy.memory
+    assert policy.memory.integral
+    position, radius, limit = astuple(policy.memory.integral)
+    if not (0.0 < radius < np.inf and 0.0 < limit < np.inf):
+        raise UnsupportedNetwork(f"an integral within {radius:g} m and {limit:g} m s: expected finite limits above 0")
+    steps = lsb[list(position)]
+    increment = policy.control_period_s * steps / (limit / INT16)  # at one step of the position, ungated
+    bits = int(np.clip(np.ceil(13.0 - np.log2(increment.max())) - 1.0, 0, INTEGRAL_BITS))
+    if increment.max() >= 2.0**13 or increment.min() * 2.0**bits < 1.0:
+        raise UnsupportedNetwork(f"an integral within {limit:g} m s: expected a limit nearer to position and period")
+    gain, gain_shift = _as_factor(2.0 * increment * 2.0**bits)
+    inverse_radius, radius_shift = _as_factor(steps / radius * 2.0**15)
+    if radius_shift.min() < 1 or radius_shift.max() > 30:
+        raise UnsupportedNetwork(f"an integral within {radius:g} m: expected a radius nearer to the range of positions")
+    unit = limit / INT16 / 2.0**bits
+    return (
+        integers.Integral(
+            position=position,
+            inverse_radius=inverse_radius,
+            inverse_radius_shift=radius_shift,
+            gain=gain,
+            gain_shift=gain_shift,
+            limit=INT16 << bits,
+            unit_m_s=unit,
+        ),
+        bits,
+    )
+
+
+def _as_factor(value: Floats) -> tuple[Ints, Ints]:
+    """Factor in [2¹⁴, 2¹⁵) and shift with value ≈ factor / 2^shift."""
+    fraction, power = np.frexp(value)
+    return np.minimum(np.round(fraction * 2**15), INT16).astype(np.int64), (15 - power).astype(np.int64)
 
 
 def _check(policy: Policy) -> None:
@@ -117,6 +211,11 @@ def _check(policy: Policy) -> None:
     for i, (weight, bias) in enumerate(policy.layers):
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             raise UnsupportedNetwork(f"layer {i}: a weight is not finite")
+    if policy.memory and not policy.memory_size:
+        raise UnsupportedNetwork("a memory that holds nothing")
+    expected = len(policy.observations) + policy.memory_size
+    if len(policy.layers[0][0]) != expected:
+        raise UnsupportedNetwork(f"layer 0: expected {expected} inputs, found {len(policy.layers[0][0])}")
     if not np.isfinite(policy.calibration).all() or not len(policy.calibration):
         raise UnsupportedNetwork("no finite flight to calibrate on")
 

@@ -67,7 +67,7 @@ def gates(measured: Measured) -> list[Gate]:
     return found
 
 
-def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
+def report(policy: Policy, kernel: Kernel, measured: Measured, name: str) -> str:
     found = gates(measured)
     failed = [gate for gate in found if not gate.passed]
     run = policy.provenance
@@ -81,8 +81,8 @@ def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
         "",
         *_verification(kernel, measured.verification),
         *_accuracy(measured, found),
-        *_costs(policy, measured),
-        USAGE,
+        *_costs(policy, measured, name),
+        USAGE.format(name=name),
     ]
     return "\n".join(lines)
 
@@ -90,7 +90,8 @@ def report(policy: Policy, kernel: Kernel, measured: Measured) -> str:
 def _verification(kernel: Kernel, verification: VerificationReport) -> Iterable[str]:
     bound = accumulator_bound(kernel)
     yield "## Verification\n"
-    yield f"- Proved: no accumulator exceeds {bound:,} for any observation, {bound / 2**31:.1%} of the 32-bit range."
+    inputs = "observation" if kernel.memory is None else "observation and state"
+    yield f"- Proved: no accumulator exceeds {bound:,} for any {inputs}, {bound / 2**31:.1%} of the 32-bit range."
     if verification.passed:
         yield (
             f"- Verified: the C equals the NumPy reference bit for bit on {verification.vectors:,} vectors per entry"
@@ -100,6 +101,11 @@ def _verification(kernel: Kernel, verification: VerificationReport) -> Iterable[
             "  The vectors: observations of flights, corners of the ranges, saturating values, random bits, denormals,"
             " infinities, NaN."
         )
+        if verification.steps:
+            yield (
+                "- The same for the state after each, in sequences; and on smooth sequences of {:,} steps on the host,"
+                " {:,} on a core.".format(*verification.steps)
+            )
     yield from (f"- Skipped {line}." for line in verification.skipped)
     yield ""
 
@@ -121,22 +127,22 @@ def _accuracy(measured: Measured, found: list[Gate]) -> Iterable[str]:
     yield ""
 
 
-def _costs(policy: Policy, measured: Measured) -> Iterable[str]:
+def _costs(policy: Policy, measured: Measured, name: str) -> Iterable[str]:
     yield "## Costs\n"
     costs = measured.verification.costs
     if not costs:
         yield "Not measured: this needs the Arm compiler and QEMU (above).\n"
         return
-    yield "Instructions per inference under QEMU: mean over the policy's flights (maximum over all vectors).\n"
-    yield "| core | `qrl_policy_step` | `qrl_policy_step_i16` |\n|---|---|---|"
+    yield "Instructions per inference under QEMU: mean of inputs in range (maximum over all vectors).\n"
+    yield f"| core | `{name}_step` | `{name}_step_i16` |\n|---|---|---|"
     for cost in costs:
         both = (f"{mean:,.0f} ({most:,.0f})" for mean, most in (cost.step, cost.step_i16))
         yield f"| {cost.core.name} | {' | '.join(both)} |"
-    yield "\n| core | flash | static RAM | stack: float entry | i16 entry | self-test | compiler library |"
-    yield "|---|---|---|---|---|---|---|"
+    yield "\n| core | flash | state | static RAM | stack: float entry | i16 entry | self-test | compiler library |"
+    yield "|---|---|---|---|---|---|---|---|"
     for cost in costs:
-        stacks = " | ".join(f"{stack} B" for stack in cost.stack)
-        yield f"| {cost.core.name} | {cost.flash:,} B | {cost.static_ram} B | {stacks} | {cost.library:,} B |"
+        sizes = cost.flash, cost.state, cost.static_ram, *cost.stack, cost.library
+        yield f"| {cost.core.name} | {' | '.join(f'{size:,} B' for size in sizes)} |"
     yield "\nFlash: text and data of the one object, -O2, all entry points and the self-test with its vectors.\n"
     yield (
         "Estimated rates: QEMU counts instructions, not cycles, so the cycles per instruction are assumed. Flash wait"
@@ -155,11 +161,13 @@ def _costs(policy: Policy, measured: Measured) -> Iterable[str]:
 USAGE = """\
 ## Use
 
-Add `qrl_policy.h` and `qrl_policy.c` to the firmware: C99, no libm, no heap, no state. The header documents\
+Add `{name}.h` and `{name}.c` to the firmware: C99, no libm, no heap, no static state. The header documents\
  every input and output: order, unit, frame, range, motor positions and spins.
 
 - `examples/bare_metal`: `make` runs it on the host; `CMakeLists.txt` for CMake.
-- Arduino: this folder is a library; copy it to `libraries/qrl_policy`. PlatformIO: to `lib/qrl_policy`.
-- Call `qrl_policy_selftest()` at boot and do not fly unless it returns 0.
+- Arduino: this folder is a library; copy it to `libraries/{name}`. PlatformIO: to `lib/{name}`.
+- Call `{name}_selftest()` at boot and do not fly unless it returns 0; `{name}_reset(&state)` before the first step and
+  whenever the policy takes up control again.
+- All names begin with `{name}`: any number of exports of different names link into one firmware.
 - `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.
 """

@@ -1,8 +1,9 @@
 """Compiles an emitted kernel and runs it on the host and, with instruction counts, on four Cortex-M under QEMU.
 
-`harness/harness.c` runs both entry points over files of observations, writes all outputs to a file, and prints one
-result line at the end. A run without exactly one result line and a complete output file raises VerificationFailed.
-Each run has its own folder, so runs may be concurrent.
+A kernel is given by the path of its NAME.c; NAME.h is beside it. `harness/harness.c` runs both entry points over files
+of observations, writes all outputs and states to a file, and prints one result line at the end. A run without exactly
+one result line and a complete output file raises VerificationFailed. Each run has its own folder, so runs may be
+concurrent.
 """
 
 import os
@@ -16,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from qrl.export.vectors import Outputs
+from qrl.export.vectors import Observations, Outputs
 
 Floats = np.ndarray[tuple[int, ...], np.dtype[np.floating]]
 Ints = np.ndarray[tuple[int, ...], np.dtype[np.integer]]
@@ -29,7 +30,17 @@ RELEASE = ("-std=c99", "-O2", *WARNINGS)  # for sizes and instruction counts
 TIMEOUT_S = 60.0
 CLOCK_ERROR = 8  # instructions, per measured call: two rounds of the loops around it
 KNOWN_ROUNDS = (1000, 12345)  # of a loop of known length, timed in each run
-GUARD = 0xA5  # value of each byte after the outputs, set by the harness
+GUARD = 0xA5  # value of each byte after the outputs and the state, set by the harness
+UNDER_TEST = """\
+#include "{name}.h"
+
+enum {{ OBS = {NAME}_OBS_SIZE, ACT = {NAME}_ACT_SIZE }};
+typedef {name}_state kernel_state;
+#define kernel_reset {name}_reset
+#define kernel_step {name}_step
+#define kernel_step_i16 {name}_step_i16
+#define kernel_selftest {name}_selftest
+"""
 
 
 class Core(NamedTuple):
@@ -71,7 +82,7 @@ class Counts(NamedTuple):
 
 
 class Sizes(NamedTuple):
-    """Bytes of qrl_policy.o, and of the library code that it needs."""
+    """Bytes of the object file, and of the library code that it needs."""
 
     text: int
     data: int
@@ -96,37 +107,31 @@ def missing_tools() -> list[str]:
 
 
 def run_host(
-    kernel: Path, work: Path, flags: Sequence[str], obs_f32: Floats, obs_i16: Ints, libraries: Sequence[str] = ()
+    kernel: Path, work: Path, flags: Sequence[str], given: Observations, libraries: Sequence[str] = ()
 ) -> Outputs:
-    """Outputs of `kernel` (a folder) on this machine for observations [N, O] and [M, O], compiled with `flags`."""
+    """Outputs of `kernel` on this machine for the observations `given`, compiled with `flags`."""
     compiler = host_compiler()
     if compiler is None:
         raise VerificationFailed("no C compiler on this machine (cc, gcc or clang)")
-    folder = _folder(work, "host", obs_f32, obs_i16)
-    _build([compiler, *flags, *_sources(kernel, "host.c"), *libraries, "-o", "kernel"], folder, "host")
+    folder = _folder(kernel, work, "host", given)
+    _build([compiler, *flags, *_sources(kernel, folder, "host.c"), *libraries, "-o", "kernel"], folder, "host")
     output = _run([str(folder.resolve() / "kernel")], folder, "host")
-    return _read(folder, "host", output, obs_f32, obs_i16)[0]
+    return _read(folder, "host", kernel.stem, output, given)[0]
 
 
 def run_core(
-    core: Core,
-    kernel: Path,
-    work: Path,
-    flags: Sequence[str],
-    obs_f32: Floats,
-    obs_i16: Ints,
-    libraries: Sequence[str] = (),
+    core: Core, kernel: Path, work: Path, flags: Sequence[str], given: Observations, libraries: Sequence[str] = ()
 ) -> tuple[Outputs, Counts]:
     """Outputs and costs of `kernel` on `core`; linked with libc, libgcc and `libraries` only."""
-    folder = _folder(work, core.name, obs_f32, obs_i16)
+    folder = _folder(kernel, work, core.name, given)
     memory = [f"-Wl,--defsym=FLASH_BYTES={core.flash_bytes}", f"-Wl,--defsym=RAM_BYTES={core.ram_bytes}"]
     link = ["-nostdlib", "-T", str(SOURCES / "cortex_m.ld"), *memory, *libraries, "-lc", "-lgcc"]
-    sources = _sources(kernel, "startup.c")
+    sources = _sources(kernel, folder, "startup.c")
     _build(["arm-none-eabi-gcc", *core.flags, *flags, *sources, *link, "-o", "kernel.elf"], folder, core.name)
     qemu = ["qemu-system-arm", "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
     semihosting = ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native"]
     output = _run([*qemu, *semihosting, "-kernel", "kernel.elf"], folder, core.name)
-    outputs, fields, elapsed = _read(folder, core.name, output, obs_f32, obs_i16)
+    outputs, fields, elapsed = _read(folder, core.name, kernel.stem, output, given)
     return outputs, _counts(core, fields, elapsed)
 
 
@@ -134,10 +139,10 @@ def size(core: Core, kernel: Path, work: Path) -> Sizes:
     """Size of the object file of `kernel` on `core`, and of the library code that it needs."""
     folder = Path(tempfile.mkdtemp(prefix=f"{core.name}-size-", dir=work))
     compiler = ["arm-none-eabi-gcc", *core.flags]
-    _build([*compiler, *RELEASE, "-c", str(kernel.resolve() / "qrl_policy.c"), "-o", "qrl_policy.o"], folder, core.name)
-    entry = ["-nostdlib", "-Wl,--entry=qrl_policy_step"]
-    _build([*compiler, *entry, "qrl_policy.o", "-lc", "-lgcc", "-o", "linked.elf"], folder, core.name)
-    (text, data, bss), linked = (_sections(folder / name, core.name) for name in ("qrl_policy.o", "linked.elf"))
+    _build([*compiler, *RELEASE, "-c", str(kernel.resolve()), "-o", "kernel.o"], folder, core.name)
+    entry = ["-nostdlib", f"-Wl,--entry={kernel.stem}_step"]
+    _build([*compiler, *entry, "kernel.o", "-lc", "-lgcc", "-o", "linked.elf"], folder, core.name)
+    (text, data, bss), linked = (_sections(folder / name, core.name) for name in ("kernel.o", "linked.elf"))
     return Sizes(text, data, bss, max(0, linked[0] - text))
 
 
@@ -146,16 +151,19 @@ def _sections(path: Path, where: str) -> list[int]:
     return [int(number) for number in table.splitlines()[1].split()[:3]]
 
 
-def _folder(work: Path, name: str, obs_f32: Floats, obs_i16: Ints) -> Path:
+def _folder(kernel: Path, work: Path, name: str, given: Observations) -> Path:
     folder = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=work))
-    (folder / "f32.bin").write_bytes(np.ascontiguousarray(obs_f32, "<f4").tobytes())
-    (folder / "i16.bin").write_bytes(np.ascontiguousarray(obs_i16, "<i2").tobytes())
+    length = np.array(given.length, "<i4").tobytes()
+    (folder / "f32.bin").write_bytes(length + np.ascontiguousarray(given.obs, "<f4").tobytes())
+    (folder / "i16.bin").write_bytes(length + np.ascontiguousarray(given.obs_i16, "<i2").tobytes())
+    header = UNDER_TEST.format(name=kernel.stem, NAME=kernel.stem.upper())
+    (folder / "kernel_under_test.h").write_text(header, encoding="utf-8")
     return folder
 
 
-def _sources(kernel: Path, platform: str) -> list[str]:
-    folder = kernel.resolve()
-    return ["-I", str(folder), str(folder / "qrl_policy.c"), str(SOURCES / "harness.c"), str(SOURCES / platform)]
+def _sources(kernel: Path, folder: Path, platform: str) -> list[str]:
+    places = [f"-I{folder.resolve()}", f"-I{kernel.resolve().parent}"]
+    return [*places, str(kernel.resolve()), str(SOURCES / "harness.c"), str(SOURCES / platform)]
 
 
 def _build(command: list[str], folder: Path, where: str) -> str:
@@ -189,31 +197,45 @@ def _run(command: list[str], folder: Path, where: str) -> str:
 
 
 def _read(
-    folder: Path, where: str, output: str, obs_f32: Floats, obs_i16: Ints
+    folder: Path, where: str, name: str, output: str, given: Observations
 ) -> tuple[Outputs, dict[str, int], tuple[Ints, Ints]]:
     """Outputs, the fields of the result line, and (ticks, spins) int32 [N, 2], [M, 2] of a complete run."""
+    obs_f32, obs_i16 = given.obs, given.obs_i16
     lines = [line for line in output.splitlines() if line.startswith("qrl-result:")]
     if len(lines) != 1:
         raise VerificationFailed(f"{where}: expected one result line, found {len(lines)}")
-    fields = {name: int(value) for name, value in re.findall(r"(\w+)=(-?\d+)", lines[0])}
+    fields = {field: int(value) for field, value in re.findall(r"(\w+)=(-?\d+)", lines[0])}
     expected = {"obs": obs_f32.shape[1], "vectors_f32": len(obs_f32), "vectors_i16": len(obs_i16)}
-    found = {name: fields.get(name) for name in expected}
-    if wrong := [f"{name}: expected {n}, found {found[name]}" for name, n in expected.items() if found[name] != n]:
+    found = {field: fields.get(field) for field in expected}
+    if wrong := [f"{field}: expected {n}, found {found[field]}" for field, n in expected.items() if found[field] != n]:
         raise VerificationFailed(f"{where}: {', '.join(wrong)}")
-    act, bytes_act = fields["act"], 4 * (fields["act"] + 2)
-    layouts = [
-        np.dtype([("status", "<i4"), ("act", t, act), ("guard", "u1", bytes_act - act * each), ("elapsed", "<i4", 2)])
-        for t, each in (("<f4", 4), ("<i2", 2))
-    ]
+    layouts = [_layout(fields, kind) for kind in ("<f4", "<i2")]
     data, split = (folder / "out.bin").read_bytes(), len(obs_f32) * layouts[0].itemsize
     if len(data) != (length := split + len(obs_i16) * layouts[1].itemsize):
         raise VerificationFailed(f"{where}: out.bin: expected {length} bytes, found {len(data)}")
     f32, i16 = np.frombuffer(data[:split], layouts[0]), np.frombuffer(data[split:], layouts[1])
-    for records, entry in ((f32, "qrl_policy_step"), (i16, "qrl_policy_step_i16")):
-        if np.any(records["guard"] != GUARD):
-            raise VerificationFailed(f"{where}: {entry} writes past the end of its outputs")
-    outputs = Outputs(f32["status"], f32["act"], i16["status"], i16["act"], fields["selftest"])
-    return outputs, fields, (f32["elapsed"], i16["elapsed"])
+    for records, entry in ((f32, f"{name}_step"), (i16, f"{name}_step_i16")):
+        for guard, what in (("guard", "outputs"), ("state_guard", "state")):
+            if np.any(records[guard] != GUARD):
+                raise VerificationFailed(f"{where}: {entry} writes past the end of its {what}")
+    both = [each[part] for each in (f32, i16) for part in ("status", "act", "state")]
+    return Outputs(*both, selftest=fields["selftest"]), fields, (f32["elapsed"], i16["elapsed"])
+
+
+def _layout(fields: dict[str, int], kind: str) -> np.dtype:
+    """A record of out.bin whose actions are of the type `kind`."""
+    state, act = fields["state"], fields["act"]
+    state_words, act_words = -(-state // 4) + 1, act + 2
+    return np.dtype(
+        [
+            ("status", "<i4"),
+            ("state", "u1", state),
+            ("state_guard", "u1", 4 * state_words - state),
+            ("act", kind, act),
+            ("guard", "u1", 4 * act_words - act * np.dtype(kind).itemsize),
+            ("elapsed", "<i4", 2),
+        ]
+    )
 
 
 def _counts(core: Core, fields: dict[str, int], elapsed: tuple[Ints, Ints]) -> Counts:

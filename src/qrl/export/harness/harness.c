@@ -1,25 +1,29 @@
 /* Runs an emitted kernel over files of observations, on a host and on a target alike.
 
-   Reads   f32.bin  observations, float32 little-endian [N, OBS]
-           i16.bin  observations, int16 [M, OBS]
+   Reads   f32.bin  int32 little-endian: observations from one reset to the next; observations, float32 [N, OBS]
+           i16.bin  the same in int16 [M, OBS]
    Writes  out.bin  N + M records (below)
    and finally exactly one line of text that begins "qrl-result:", with counts, the self-test's result and the
    measurements. An error is one line that begins "qrl-error:". */
 #include <string.h>
 
+#include "kernel_under_test.h"
 #include "platform.h"
-#include "qrl_policy.h"
 
-enum { OBS = QRL_POLICY_OBS_SIZE, ACT = QRL_POLICY_ACT_SIZE, POISON = 0xA5 };
+enum { POISON = 0xA5 };
 
 static union {
     float f32[OBS];
     int16_t i16[OBS];
 } obs;
 
-/* Poisoned before each call, which reveals a missing output or one too many. */
+/* Poisoned before each call, which reveals a missing output or one too many; the state before each reset. */
 static struct {
     int32_t status;
+    union {
+        kernel_state state;
+        int32_t words[(sizeof(kernel_state) + 3) / 4 + 1];
+    } kept;
     union {
         float f32[ACT + 2];
         int16_t i16[ACT + 2];
@@ -40,14 +44,22 @@ static void require(int good, const char *error)
 /* Runs one entry point over the observations of a file, and returns their number. */
 static int32_t run(intptr_t out, const char *name, uint32_t bytes_each, enum entry entry)
 {
-    int32_t total = 0;
+    int32_t total = 0, length = 0;
     uint32_t bytes;
+    static kernel_state state;
     intptr_t in = file_open(name, 0);
-    require(in != 0, "an observation file cannot be read");
+    require(in != 0 && file_read(in, &length, sizeof length) == sizeof length, "an observation file cannot be read");
+    require(length > 0, "a sequence has no length");
     while ((bytes = file_read(in, &obs, bytes_each)) != 0) {
         require(bytes == bytes_each, "an observation file ends within a vector");
         memset(&record, POISON, sizeof record);
-        record.status = call(entry, &obs, &record.act, &record.elapsed);
+        if (total % length == 0) {
+            kernel_reset(&record.kept.state);
+        } else {
+            record.kept.state = state;
+        }
+        record.status = call(entry, &record.kept.state, &obs, &record.act, &record.elapsed);
+        state = record.kept.state;
         require(file_write(out, &record, sizeof record) == sizeof record, "out.bin cannot be written");
         total++;
     }
@@ -77,7 +89,7 @@ static void report(const char *name, int32_t value)
 static int report_call(enum entry entry, uintptr_t rounds, const char *ticks_name, const char *spins_name)
 {
     struct elapsed elapsed;
-    int status = call(entry, (const void *)rounds, 0, &elapsed);
+    int status = call(entry, (void *)rounds, 0, 0, &elapsed);
     report(ticks_name, elapsed.ticks);
     report(spins_name, elapsed.spins);
     return status;
@@ -89,6 +101,7 @@ int main(void)
     require(out != 0, "out.bin cannot be written");
     report("obs", OBS);
     report("act", ACT);
+    report("state", sizeof(kernel_state));
     report_call(KNOWN, 0, "known_0_ticks", "known_0_spins");
     report_call(KNOWN, 1000, "known_1000_ticks", "known_1000_spins");
     report_call(KNOWN, 12345, "known_12345_ticks", "known_12345_spins");

@@ -4,7 +4,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 
-#include "qrl_policy.h"
+#include "kernel_under_test.h"
 
 intptr_t file_open(const char *name, int writing) { return (intptr_t)fopen(name, writing ? "wb" : "rb"); }
 
@@ -21,16 +21,16 @@ void print_text(const char *text) { fputs(text, stderr); }
 
 void finish(int code) { exit(code); }
 
-int call(enum entry entry, const void *obs, void *act, struct elapsed *elapsed)
+int call(enum entry entry, void *state, const void *obs, void *act, struct elapsed *elapsed)
 {
     elapsed->ticks = elapsed->spins = 0;
     switch (entry) {
     case STEP:
-        return qrl_policy_step(obs, act);
+        return kernel_step(state, obs, act);
     case STEP_I16:
-        return qrl_policy_step_i16(obs, act);
+        return kernel_step_i16(state, obs, act);
     case SELFTEST:
-        return qrl_policy_selftest();
+        return kernel_selftest();
     default:
         return 0;
     }

@@ -19,9 +19,9 @@ void print_text(const char *text);
 void finish(int code) __attribute__((noreturn));
 
 /* A measured call, on a stack of its own, of one of the kernel's functions or of KNOWN, a function of exactly
-   2 * rounds + 3 instructions with (void *)rounds for `obs`; on a host KNOWN does nothing. */
+   2 * rounds + 3 instructions with (void *)rounds for `state`; on a host KNOWN does nothing. */
 enum entry { STEP, STEP_I16, SELFTEST, KNOWN };
-int call(enum entry entry, const void *obs, void *act, struct elapsed *elapsed);
+int call(enum entry entry, void *state, const void *obs, void *act, struct elapsed *elapsed);
 
 void stack_paint(void);
 int32_t stack_depth(void); /* bytes of that stack used since it was painted; 0 on a host */

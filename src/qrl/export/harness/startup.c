@@ -1,7 +1,6 @@
 /* The harness's platform on a Cortex-M under QEMU: start-up, semihosting, the tick counter and a painted stack. */
+#include "kernel_under_test.h"
 #include "platform.h"
-
-#include "qrl_policy.h"
 
 /* Addresses from the linker, in a table: compilers assume that different symbols have different addresses. */
 extern struct {
@@ -76,15 +75,19 @@ void fault(void)
     finish(1);
 }
 
-/* timed(obs, act, function, elapsed): the function's result. Waits for an edge of SysTick, calls the function on the
-   kernel's stack, and counts rounds of four instructions until the next edge. */
-int timed(const void *obs, void *act, void (*function)(void), struct elapsed *elapsed);
+/* timed(arguments, function, elapsed): the result of the function of three arguments. Waits for an edge of SysTick,
+   calls the function on the kernel's stack, and counts rounds of four instructions until the next edge. */
+int timed(const void *const arguments[3], void (*function)(void), struct elapsed *elapsed);
 __asm__(".syntax unified\n"
         ".thumb_func\n"
         "timed:\n"
         "    push {r4-r7, lr}\n"
         "    mov  r4, sp\n"
-        "    mov  r5, r3\n"
+        "    mov  r5, r2\n"
+        "    mov  r12, r1\n"
+        "    ldr  r1, [r0, #4]\n"
+        "    ldr  r2, [r0, #8]\n"
+        "    ldr  r0, [r0]\n"
         "    ldr  r6, =0xE000E018\n" /* SysTick's current value, 24 bits, counting down */
         "    ldr  r3, [r6]\n"
         "1:  ldr  r7, [r6]\n"
@@ -92,7 +95,7 @@ __asm__(".syntax unified\n"
         "    beq  1b\n"
         "    ldr  r3, =kernel_stack_end\n"
         "    mov  sp, r3\n"
-        "    blx  r2\n"
+        "    blx  r12\n"
         "    mov  sp, r4\n"
         "    ldr  r1, [r6]\n"
         "    movs r2, #0\n"
@@ -118,15 +121,16 @@ __asm__(".thumb_func\n"
         "    bne  1b\n"
         "2:  bx   lr\n");
 
-int call(enum entry entry, const void *obs, void *act, struct elapsed *elapsed)
+int call(enum entry entry, void *state, const void *obs, void *act, struct elapsed *elapsed)
 {
     static void (*const functions[])(void) = {
-        [STEP] = (void (*)(void))qrl_policy_step,
-        [STEP_I16] = (void (*)(void))qrl_policy_step_i16,
-        [SELFTEST] = (void (*)(void))qrl_policy_selftest,
+        [STEP] = (void (*)(void))kernel_step,
+        [STEP_I16] = (void (*)(void))kernel_step_i16,
+        [SELFTEST] = (void (*)(void))kernel_selftest,
         [KNOWN] = (void (*)(void))known,
     };
-    return timed(obs, act, functions[entry], elapsed);
+    const void *const arguments[3] = {state, obs, act};
+    return timed(arguments, functions[entry], elapsed);
 }
 
 #define PAINT 0xC5A5A5C5u

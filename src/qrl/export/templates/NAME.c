@@ -1,9 +1,9 @@
 /*
 @banner@
- * See qrl_policy.h for inputs, outputs and the license (unrestricted).
+ * See @name@.h for inputs, outputs and the license (unrestricted).
  */
 
-#include "qrl_policy.h"
+#include "@name@.h"
 
 /*
  * An integer network: int8 weights with one scale per output, int16 activations, int32 accumulators.
@@ -26,6 +26,8 @@
 
 /* The code below shifts negative numbers arithmetically; C99 leaves that to the compiler. */
 typedef char needs_arithmetic_right_shift[(-1 >> 1) == -1 ? 1 : -1];
+
+typedef char the_state_has_its_size[sizeof(@name@_state) == @state_size@ ? 1 : -1];
 
 #ifdef BODY_ARMV6M
 /* These cores load bytes with an offset as unsigned only. With u = w + 2^7, v = x + 2^15, modulo 2^32, where
@@ -59,6 +61,10 @@ typedef uint16_t factors;
 #define W4(w0, w1, w2, w3) Q(w0), Q(w2), Q(w1), Q(w3)
 
 #define TANH @tanh@ /* else ReLU */
+#define PREVIOUS_ACTION @previous_action@ /* inputs of the network after the observation: the previous action, */
+#define INTEGRAL @integral@        /* then the integral of the position */
+#define MEMORY (PREVIOUS_ACTION || INTEGRAL)
+#define INPUTS @inputs@
 
 union activations {
     activation one[@widest@];
@@ -83,11 +89,29 @@ struct input {
 };
 
 struct golden {
-    float obs[QRL_POLICY_OBS_SIZE];
-    int16_t obs_i16[QRL_POLICY_OBS_SIZE];
-    int16_t act[QRL_POLICY_ACT_SIZE];
+    float obs[@NAME@_OBS_SIZE];
+    int16_t obs_i16[@NAME@_OBS_SIZE];
+    int16_t act[@NAME@_ACT_SIZE];
     int8_t status, status_i16;
 };
+
+#if MEMORY
+struct kept {
+    uint8_t shift; /* an input is a value of the state / 2^shift, */
+    int16_t least; /* saturated at least and most */
+    int16_t most;
+};
+#endif
+
+#if INTEGRAL
+struct axis {
+    uint8_t input; /* of the position: where it stands in obs, */
+    uint8_t shift; /* and its input is the position / 2^shift */
+    uint16_t inverse_radius;
+    uint16_t gain;
+    uint8_t inverse_radius_shift, gain_shift;
+};
+#endif
 
 @tables@
 
@@ -211,6 +235,19 @@ static inline int32_t activated(int32_t z) {
 
 #endif
 
+#if !defined(BODY_DSP) || INTEGRAL
+
+/* floor(x * factor / 2^16) */
+static inline int32_t scaled(int32_t x, uint32_t factor) {
+#ifdef BODY_ARMV6M /* by halves: there is no 64-bit product */
+    return (x >> 16) * (int32_t)factor + (int32_t)((uint16_t)x * factor >> 16);
+#else
+    return (int32_t)(((int64_t)x * (int32_t)(factor << 16)) >> 32);
+#endif
+}
+
+#endif
+
 /* The outputs of four accumulators; `hidden` layers have an activation. */
 #ifdef BODY_DSP
 
@@ -234,12 +271,7 @@ static inline void four_outputs(union activations *y, int at, const struct four 
 #else
 
 static inline activation output(accumulator acc, uint32_t factor, int shift, int hidden) {
-#ifdef BODY_ARMV6M /* by halves: there is no 64-bit product */
-    const int32_t high = (int32_t)acc >> 16;
-    const int32_t z = (high * (int32_t)factor + (int32_t)((uint16_t)acc * factor >> 16)) >> shift;
-#else
-    const int32_t z = (int32_t)(((int64_t)acc * (int32_t)(factor << 16)) >> 32) >> shift;
-#endif
+    const int32_t z = scaled((int32_t)acc, factor) >> shift;
     return (activation)((hidden ? activated(z) : saturated(z)) + OFFSET);
 }
 
@@ -303,8 +335,62 @@ static int put(union activations *x, int i, int32_t q) {
     return within != q;
 }
 
-static void fill_up(union activations *x) {
-    for (int i = QRL_POLICY_OBS_SIZE; i < PADDED_OBS_SIZE; ++i) {
+#if MEMORY
+
+static inline int32_t limited(int32_t x, int32_t least, int32_t most) {
+    return x < least ? least : x > most ? most : x;
+}
+
+/* x / 2^shift, rounded; half is rounded up. */
+static inline int32_t shifted(int32_t x, int shift) {
+    return (x + ((int32_t)1 << shift >> 1)) >> shift;
+}
+
+#endif
+
+#if INTEGRAL
+
+/* integral += period * p * max(0, 1 - |p|^2 / radius^2)^2, within its limits, p the position among the inputs. */
+static void integrate(int32_t integral[3], union activations *x) {
+    int32_t p[3], inside = (int32_t)1 << 30; /* 1 - |p|^2 / radius^2, in 1 / 2^30 */
+    for (int i = 0; i < 3; ++i) {
+        p[i] = (int32_t)x->one[axes[i].input] - OFFSET;
+        x->one[axes[i].input] = (activation)(shifted(p[i], axes[i].shift) + OFFSET);
+        const int32_t v = shifted(p[i] * axes[i].inverse_radius, axes[i].inverse_radius_shift);
+        inside -= v >= 32768 || v <= -32768 ? (int32_t)1 << 30 : v * v;
+    }
+    inside = inside > 0 ? inside >> 15 : 0;
+    const int32_t gate = inside * inside >> 15; /* 2^15: open */
+    for (int i = 0; i < 3; ++i) {
+        const int32_t more = shifted(scaled(p[i] * gate, axes[i].gain), axes[i].gain_shift);
+        integral[i] = limited(integral[i] + more, -INTEGRAL_LIMIT, INTEGRAL_LIMIT);
+    }
+}
+
+#endif
+
+/* The inputs after the observation, which is complete: those of the state, and zeros up to a multiple of 4. */
+static void complete(union activations *x, @name@_state *state) {
+    int i = @NAME@_OBS_SIZE;
+#if INTEGRAL
+    integrate(state->integral, x);
+#endif
+#if MEMORY
+    for (const struct kept *k = kept; i < INPUTS; ++i, ++k) {
+        const int at = i - @NAME@_OBS_SIZE;
+#if PREVIOUS_ACTION && INTEGRAL
+        const int32_t value = at < @NAME@_ACT_SIZE ? state->previous_action[at] : state->integral[at - @NAME@_ACT_SIZE];
+#elif PREVIOUS_ACTION
+        const int32_t value = state->previous_action[at];
+#else
+        const int32_t value = state->integral[at];
+#endif
+        x->one[i] = (activation)(limited(shifted(value, k->shift), k->least, k->most) + OFFSET);
+    }
+#else
+    (void)state;
+#endif
+    for (; i < PADDED_INPUTS; ++i) {
         x->one[i] = (activation)OFFSET;
     }
 }
@@ -321,65 +407,117 @@ static int32_t quantised(uint32_t bits, const struct input *in) {
     return bits >> 31 ? -size : size;
 }
 
-int qrl_policy_step(const float obs[QRL_POLICY_OBS_SIZE], float act[QRL_POLICY_ACT_SIZE]) {
+void @name@_reset(@name@_state *state) {
+#if INTEGRAL
+    state->integral[0] = state->integral[1] = state->integral[2] = 0;
+#endif
+#if PREVIOUS_ACTION
+    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
+        state->previous_action[i] = act_first[i];
+    }
+#endif
+#if !MEMORY
+    state->unused = 0;
+#endif
+}
+
+int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act[@NAME@_ACT_SIZE]) {
     union activations a, b;
     int status = 0;
-    for (int i = 0; i < QRL_POLICY_OBS_SIZE; ++i) {
+    for (int i = 0; i < @NAME@_OBS_SIZE; ++i) {
         const union {
             float real;
             uint32_t bits;
         } in = {obs[i]};
         if ((in.bits & 0x7f800000u) == 0x7f800000u) { /* by its bits: -ffast-math assumes that no float is NaN */
-            for (int j = 0; j < QRL_POLICY_ACT_SIZE; ++j) {
+            for (int j = 0; j < @NAME@_ACT_SIZE; ++j) {
                 act[j] = act_safe[j];
             }
             return 2;
         }
         status |= put(&a, i, quantised(in.bits, &inputs[i]));
     }
-    fill_up(&a);
+    complete(&a, state);
     const activation *const y = network(&a, &b);
-    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
-        act[i] = (float)action(y[i], i) * act_lsb[i];
+    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
+        const int16_t steps = action(y[i], i);
+#if PREVIOUS_ACTION
+        state->previous_action[i] = steps;
+#endif
+        act[i] = (float)steps * act_lsb[i];
     }
     return status;
 }
 
-int qrl_policy_step_i16(const int16_t obs[QRL_POLICY_OBS_SIZE], int16_t act[QRL_POLICY_ACT_SIZE]) {
+int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int16_t act[@NAME@_ACT_SIZE]) {
     union activations a, b;
     int status = 0;
-    for (int i = 0; i < QRL_POLICY_OBS_SIZE; ++i) {
+    for (int i = 0; i < @NAME@_OBS_SIZE; ++i) {
         status |= put(&a, i, obs[i]);
     }
-    fill_up(&a);
+    complete(&a, state);
     const activation *const y = network(&a, &b);
-    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
         act[i] = action(y[i], i);
+#if PREVIOUS_ACTION
+        state->previous_action[i] = act[i];
+#endif
     }
     return status;
 }
 
-int qrl_policy_selftest(void) {
+#if MEMORY
+
+/* Whether the state is not the one after the last golden vector. */
+static int differs(const @name@_state *state) {
+    int wrong = 0;
+#if PREVIOUS_ACTION
+    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
+        wrong |= state->previous_action[i] != goldens[GOLDENS - 1].act[i];
+    }
+#endif
+#if INTEGRAL
+    for (int i = 0; i < 3; ++i) {
+        wrong |= state->integral[i] != golden_integral[i];
+    }
+#endif
+    return wrong;
+}
+
+#endif
+
+int @name@_selftest(void) {
     static const union {
-        uint32_t bits[QRL_POLICY_OBS_SIZE];
-        float obs[QRL_POLICY_OBS_SIZE];
+        uint32_t bits[@NAME@_OBS_SIZE];
+        float obs[@NAME@_OBS_SIZE];
     } not_a_number = {{0x7fc00000u}};
-    float act[QRL_POLICY_ACT_SIZE];
+    union {
+        float real[@NAME@_ACT_SIZE];
+        int16_t steps[@NAME@_ACT_SIZE];
+    } act;
+    @name@_state state, state_i16;
+    @name@_reset(&state);
+    @name@_reset(&state_i16);
     for (int k = 0; k < GOLDENS; ++k) {
-        int16_t act_i16[QRL_POLICY_ACT_SIZE];
-        int wrong = qrl_policy_step(goldens[k].obs, act) != goldens[k].status;
-        wrong |= qrl_policy_step_i16(goldens[k].obs_i16, act_i16) != goldens[k].status_i16;
-        for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
+        int wrong = @name@_step(&state, goldens[k].obs, act.real) != goldens[k].status;
+        for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
             const volatile float wanted = (float)goldens[k].act[i] * act_lsb[i]; /* rounded to float, also on x87 */
-            wrong |= act_i16[i] != goldens[k].act[i] || !(act[i] == wanted);
+            wrong |= !(act.real[i] == wanted);
+        }
+        wrong |= @name@_step_i16(&state_i16, goldens[k].obs_i16, act.steps) != goldens[k].status_i16;
+        for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
+            wrong |= act.steps[i] != goldens[k].act[i];
         }
         if (wrong) {
             return k + 1;
         }
     }
-    int wrong = qrl_policy_step(not_a_number.obs, act) != 2;
-    for (int i = 0; i < QRL_POLICY_ACT_SIZE; ++i) {
-        wrong |= !(act[i] == act_safe[i]);
+    int wrong = @name@_step(&state, not_a_number.obs, act.real) != 2;
+    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
+        wrong |= !(act.real[i] == act_safe[i]);
     }
+#if MEMORY
+    wrong |= differs(&state) || differs(&state_i16); /* after the last vector: no number changes nothing */
+#endif
     return wrong ? GOLDENS + 1 : 0;
 }
