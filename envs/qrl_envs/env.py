@@ -247,8 +247,8 @@ class RealQuadrotorEnv(QuadrotorEnv):
 
     Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, then its
     memory, as the task has it: previous action [N], integral of the position error [3], on a circle of the height [1];
-    then what only a critic may see (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as in
-    `QuadrotorEnv`.
+    then what only a critic may see (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as
+    in `QuadrotorEnv`.
     """
 
     def __init__(

@@ -107,8 +107,8 @@ def failed_starts(success: np.ndarray) -> list[int]:
 def list_failures(task: Task, observations: np.ndarray, success: np.ndarray, limit: int) -> list[dict[str, Any]]:
     """For the first `limit` failed flights: the index of the start, the start, and the reason of the failure.
 
-    `observations` [n, K + 1, F] are NaN after an episode's early end. Reasons: "too far" (beyond the bound of distance),
-    "tumbled" (of body rate), "did not settle", or "not finite".
+    `observations` [n, K + 1, F] are NaN after an episode's early end. Reasons: "too far" (beyond the bound of
+    distance), "tumbled" (of body rate), "did not settle", or "not finite".
     """
     return [
         {"start": i, **_start(task, observations[i, 0]), "reason": _reason(task, observations[i])}

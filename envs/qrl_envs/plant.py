@@ -18,7 +18,7 @@ from qrl_envs.task import CircleReward, QuadrotorTask
 from qrl_envs.uncertainty import Uncertainty
 from qrl_envs.vehicle import Vehicle
 
-LEAST_THRUST = 1.3  # of weight and force together, unless the vehicle has less: below, a draw is made lighter
+LEAST_THRUST = 1.45  # of weight and force together, unless the vehicle has less: below, a draw is made lighter
 MOST_BODY_RATE_RAD_S = 40.0  # where it saturates
 INTEGRATION_STEP_S = 0.01  # at most; halving it changes nothing that is reported (docs/real_vehicles.md)
 NOISE_ROWS = 4096

@@ -47,7 +47,8 @@ def fly_with_memory(
     An environment with an `evaluation` is flown and measured as that says, another for one episode of
     `max_episode_steps`. `reset` draws the starts. What is recorded and measured is `info["true_obs"]`, if present,
     while the policy sees the observation. A flight that ends early has no more observations: its NaNs make it a
-    failure. Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better for it.
+    failure. Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better
+    for it.
     """
     plan = adapt(env).evaluation()
     measure = plan.measure if plan else None

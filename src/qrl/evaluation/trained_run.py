@@ -23,15 +23,17 @@ from qrl.algorithm.types import Env, State
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import calibration_starts
-from qrl.export.policy import ActionSpec, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
 from qrl_envs import task as task_spec
+from qrl_envs.plant import integrator
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task
 from qrl_envs.vehicle import shipped_vehicles
 
+POSITION = 9  # index of the position in an observation
 HostStep = Callable[[NDArray[np.integer], NDArray[np.float32]], tuple[NDArray[Any], NDArray[np.floating]]]
 """Memory [n, S] and observation [n, I] of n flights -> next memory, and action [n, A] in SI units."""
 
@@ -143,7 +145,7 @@ class TrainedRun:
         """The policy as a value in SI units, without observations to calibrate on.
 
         With `memory`, by default the task's, the environment's observation is the measured one [F], then what `Memory`
-        says in its order: the previous action a [A] in [−1, 1], the integral [3] in m·s; then what the policy does not
+        says in its order: the previous action a [A] in [−1, 1], the integral [k] in m·s; then what the policy does not
         see, if anything.
         """
         memory = memory or self._memory()
@@ -185,8 +187,15 @@ class TrainedRun:
         return round(self.task.evaluation.tail_s / self.task.control_period_s)
 
     def _memory(self) -> Memory | None:
-        """The memory that the task gives its policy; none does yet."""
-        return None
+        """The memory that the task gives its policy."""
+        if not isinstance(self.task, QuadrotorTask) or self.task.memory == task_spec.Memory():
+            return None
+        integral = integrator(self.task)
+        return Memory(
+            previous_action=self.task.memory.previous_action,
+            integral=integral
+            and Integral(tuple(POSITION + axis for axis in integral.axes), integral.radius_m, integral.limit_m_s),
+        )
 
     def _control_period_s(self) -> float:
         period = self.task.control_period_s if self.task else adapt(self.env).control_period_s
@@ -236,7 +245,7 @@ def flown_inputs(policy: Policy, flights: Flights) -> NDArray[np.float32]:
         first = policy.initial_memory(len(actions))[:, None, : actions.shape[-1]]
         parts.append(np.concatenate([first, actions[:, :-1]], axis=1))
     if policy.memory and policy.memory.integral:
-        totals = [np.zeros((len(measured), 3))]
+        totals = [np.zeros((len(measured), len(policy.memory.integral.position)))]
         for observation in measured.swapaxes(0, 1):
             totals.append(policy.integrated(totals[-1], observation))
         parts.append(np.stack(totals[1:], axis=1))

@@ -59,7 +59,8 @@ def state_bytes(kernel: Kernel) -> int:
     if kernel.memory is None:
         return 1
     action = 0 if kernel.memory.initial_action is None else 2 * len(kernel.memory.initial_action)
-    return -(-(12 + action) // 4) * 4 if kernel.memory.integral else action
+    integral = 4 * len(kernel.memory.integral.position) if kernel.memory.integral else 0
+    return -(-(integral + action) // 4) * 4 if integral else action
 
 
 def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
@@ -140,7 +141,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "state_bytes": f"{size} byte{'' if size == 1 else 's'}",
         "state_size": str(size),
         "previous_action": str(int(kernel.memory is not None and kernel.memory.initial_action is not None)),
-        "integral": str(int(kernel.memory is not None and kernel.memory.integral is not None)),
+        "integral": str(len(kernel.memory.integral.position) if kernel.memory and kernel.memory.integral else 0),
         "inputs": str(kernel.widths[0]),
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(run.task),
@@ -178,7 +179,9 @@ def _state(kernel: Kernel) -> tuple[str, str]:
         )
     fields, words = [], []
     if integral := kernel.memory.integral:
-        fields.append(f"    int32_t integral[3]; /* of the position, in {integral.unit_m_s:.4g} m s */")
+        fields.append(
+            f"    int32_t integral[{len(integral.position)}]; /* of the position, in {integral.unit_m_s:.4g} m s */"
+        )
         words.append("the integral of the position")
     if (first := kernel.memory.initial_action) is not None:
         fields.append(f"    int16_t previous_action[{len(first)}]; /* in steps of lsb */")
@@ -260,8 +263,8 @@ def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, golde
     )
     return [
         f"#define INTEGRAL_LIMIT {integral.limit}",
-        _array("struct axis axes[3]", axes, 1),
-        _array("int32_t golden_integral[3]", _integrals(golden)[goldens - 1], 3),
+        _array("struct axis axes[INTEGRAL]", axes, 1),
+        _array("int32_t golden_integral[INTEGRAL]", _integrals(golden, integral)[goldens - 1], 3),
     ]
 
 
@@ -283,9 +286,9 @@ def _layer_tables(index: int, layer: Dense) -> str:
     )
 
 
-def _integrals(golden: Vectors) -> Ints:
-    """The integral after each vector, the state's first field; [n, 3]."""
-    return np.ascontiguousarray(golden.outputs.state[:, :12]).view("<i4")
+def _integrals(golden: Vectors, integral: Integral) -> Ints:
+    """The integral after each vector, the state's first field; [n, k]."""
+    return np.ascontiguousarray(golden.outputs.state[:, : 4 * len(integral.position)]).view("<i4")
 
 
 def _golden_rows(golden: Vectors, n: int) -> Iterable[str]:
@@ -322,10 +325,11 @@ def _golden_csv(policy: Policy, kernel: Kernel, golden: Vectors) -> str:
     writer = csv.writer(out, lineterminator="\n")
     names = [port.name for port in policy.observations]
     acts = [f"{port.name}_lsb" for port in policy.actions]
-    kept = [f"integral_{axis}" for axis in "xyz"] if kernel.memory and kernel.memory.integral else []
+    integral = kernel.memory.integral if kernel.memory else None
+    kept = [f"integral_{names[i]}" for i in integral.position] if integral else []
     writer.writerow([*names, *(f"{name}_lsb" for name in names), "status", "status_i16", *acts, *kept])
     outputs = golden.outputs
-    integrals = _integrals(golden) if kept else np.zeros((len(golden.obs), 0))
+    integrals = _integrals(golden, integral) if integral else np.zeros((len(golden.obs), 0))
     columns = golden.obs, golden.obs_i16, outputs.status, outputs.status_i16, outputs.act_i16, integrals
     for obs, obs_i16, status, status_i16, act_i16, integral in zip(*columns, strict=True):
         writer.writerow([*map(str, obs), *obs_i16, status, status_i16, *act_i16, *integral])

@@ -25,15 +25,15 @@ class Dense:
 class Integral:
     """I += ⌊p·gate·gain / 2^(16 + gain_shift)⌉ per component, within ±limit, in units of `unit_m_s`.
 
-    p [3]: position in steps of the observation's lsb. With v = ⌊p·inverse_radius / 2^inverse_radius_shift⌉, which is
+    p [k]: position in steps of the observation's lsb. With v = ⌊p·inverse_radius / 2^inverse_radius_shift⌉, which is
     p/radius in 1/2¹⁵, and w = max(0, 2³⁰ − |v|²) / 2¹⁵, gate = w² / 2¹⁵, both rounded down. ⌊⌉: half is rounded up.
     """
 
     position: tuple[int, int, int]  # indices into the observation
-    inverse_radius: Ints  # [3] in [2¹⁴, 2¹⁵)
-    inverse_radius_shift: Ints  # [3] in [1, 30]
-    gain: Ints  # [3] in [0, 2¹⁵)
-    gain_shift: Ints  # [3] in [1, 30]
+    inverse_radius: Ints  # [k] in [2¹⁴, 2¹⁵)
+    inverse_radius_shift: Ints  # [k] in [1, 30]
+    gain: Ints  # [k] in [0, 2¹⁵)
+    gain_shift: Ints  # [k] in [1, 30]
     limit: int  # below 2³⁰
     unit_m_s: float
 
@@ -84,7 +84,7 @@ class Kernel:
             return np.zeros(0)
         parts = [] if self.memory.initial_action is None else [self.act_lsb.astype(np.float64)]
         if self.memory.integral:
-            parts.append(np.full(3, self.memory.integral.unit_m_s))
+            parts.append(np.full(len(self.memory.integral.position), self.memory.integral.unit_m_s))
         return np.concatenate(parts) * 2.0**self.memory.shift
 
     @property
@@ -203,19 +203,20 @@ def shifted(x: Ints, shift: Ints | int) -> Ints:
 
 
 def initial_state(kernel: Kernel, n: int) -> Ints:
-    """State [n, S] after a reset: the previous action [A], if it is an input, then the integral [3], if there is one.
+    """State [n, S] after a reset: the previous action [A], if it is an input, then the integral [k], if there is one.
 
     A policy without memory has no columns.
     """
     if kernel.memory is None:
         return np.zeros((n, 0), np.int64)
     first, integral = kernel.memory.initial_action, kernel.memory.integral
-    parts = [np.zeros(0, np.int64) if first is None else first, np.zeros(3 if integral else 0, np.int64)]
+    axes = len(integral.position) if integral else 0
+    parts = [np.zeros(0, np.int64) if first is None else first, np.zeros(axes, np.int64)]
     return np.tile(np.concatenate(parts), (n, 1))
 
 
 def integrated(integral: Integral, total: Ints, position: Ints) -> Ints:
-    """The next integral [n, 3] of positions [n, 3] in steps."""
+    """The next integral [n, k] of positions [n, k] in steps."""
     v = shifted(position * integral.inverse_radius, integral.inverse_radius_shift)
     w = np.maximum(2**30 - np.minimum(v * v, 2**30).sum(axis=-1, keepdims=True), 0) >> 15
     gate = w * w >> 15
@@ -235,8 +236,9 @@ def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
 def _act(kernel: Kernel, state: Ints, x: Ints) -> tuple[Ints, Ints]:
     """Next state and action [n, A] in steps of act_lsb, for saturated observations x [n, F]."""
     if kernel.memory and (integral := kernel.memory.integral):
-        total = integrated(integral, state[:, -3:], x[:, list(integral.position)])
-        state = np.concatenate([state[:, :-3], total], axis=-1)
+        axes = len(integral.position)
+        total = integrated(integral, state[:, -axes:], x[:, list(integral.position)])
+        state = np.concatenate([state[:, :-axes], total], axis=-1)
     action = network(kernel, inputs(kernel, state, x))
     if kernel.memory and kernel.memory.initial_action is not None:
         state = np.concatenate([action, state[:, action.shape[-1] :]], axis=-1)

@@ -56,7 +56,7 @@ class Integral:
     g(p) = p·max(0, 1 − |p|²/radius²)².
     """
 
-    position: tuple[int, int, int]  # indices into the observation
+    position: tuple[int, ...]  # indices into the observation: of p, or of the coordinates that are an error
     radius_m: float
     limit_m_s: float
 
@@ -73,7 +73,7 @@ class Memory:
 
     def size(self, actions: int) -> int:
         """Number of these inputs."""
-        return actions * self.previous_action + 3 * (self.integral is not None)
+        return actions * self.previous_action + (len(self.integral.position) if self.integral else 0)
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outputs], bias [outputs]
@@ -131,7 +131,8 @@ class Policy:
         finite = np.isfinite(observation).all(axis=-1, keepdims=True)
         observation, before = np.where(finite, observation, 0.0), memory
         if self.memory and self.memory.integral:
-            memory = np.concatenate([memory[:, :-3], self.integrated(memory[:, -3:], observation)], axis=-1)
+            axes = len(self.memory.integral.position)
+            memory = np.concatenate([memory[:, :-axes], self.integrated(memory[:, -axes:], observation)], axis=-1)
         action = self(np.concatenate([observation, memory], axis=-1))
         if self.memory and self.memory.previous_action:
             memory = np.concatenate([action, memory[:, action.shape[-1] :]], axis=-1)
@@ -139,7 +140,7 @@ class Policy:
         return np.where(finite, memory, before), np.where(finite, action, safe)
 
     def integrated(self, total: NDArray[np.float64], observation: NDArray[np.floating]) -> NDArray[np.float64]:
-        """The next integral [n, 3] for measured observations [n, F]."""
+        """The next integral [n, k] for measured observations [n, F]."""
         assert self.memory
         assert self.memory.integral
         integral = self.memory.integral

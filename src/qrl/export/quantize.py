@@ -146,7 +146,8 @@ def _memory_lsb(policy: Policy, act_lsb: NDArray[np.float32]) -> Floats:
     if memory is None:
         return np.zeros(0)
     action = act_lsb.astype(np.float64) if memory.previous_action else np.zeros(0)
-    return np.concatenate([action, np.full(3, memory.integral.limit_m_s / INT16) if memory.integral else np.zeros(0)])
+    integral = np.full(len(memory.integral.position), memory.integral.limit_m_s / INT16) if memory.integral else []
+    return np.concatenate([action, integral])
 
 
 def _memory(policy: Policy, kernel: Kernel, shift: Ints, floor: Floats, ceiling: Floats) -> integers.Memory:

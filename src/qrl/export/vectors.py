@@ -100,8 +100,9 @@ def draw_sequences(policy: Policy, kernel: Kernel, n: int, length: int, seed: in
     rows = measured[rng.integers(len(measured), size=(n, knots))]
     if policy.memory and (integral := policy.memory.integral):
         # Within the radius; of the last sequence where the gate passes most, until the integral is at its limit.
-        inside = rng.uniform(-0.6, 0.6, (n, knots, 3)) * integral.radius_m
-        inside[-1] = np.array([0.25, -0.25, 0.0]) * integral.radius_m
+        axes = len(integral.position)
+        inside = rng.uniform(-0.6, 0.6, (n, knots, axes)) * integral.radius_m
+        inside[-1] = np.array([0.25, -0.25, 0.0])[:axes] * integral.radius_m
         rows[:, :, list(integral.position)] = inside
     times = np.arange(length) * (knots - 1) / max(length - 1, 1)
     at = np.minimum(times.astype(int), knots - 2)

@@ -62,7 +62,7 @@ typedef uint16_t factors;
 
 #define TANH @tanh@ /* else ReLU */
 #define PREVIOUS_ACTION @previous_action@ /* inputs of the network after the observation: the previous action, */
-#define INTEGRAL @integral@        /* then the integral of the position */
+#define INTEGRAL @integral@        /* then the integral of so many coordinates of the position */
 #define MEMORY (PREVIOUS_ACTION || INTEGRAL)
 #define INPUTS @inputs@
 
@@ -351,9 +351,9 @@ static inline int32_t shifted(int32_t x, int shift) {
 #if INTEGRAL
 
 /* integral += period * p * max(0, 1 - |p|^2 / radius^2)^2, within its limits, p the position among the inputs. */
-static void integrate(int32_t integral[3], union activations *x) {
-    int32_t p[3], inside = (int32_t)1 << 30; /* 1 - |p|^2 / radius^2, in 1 / 2^30 */
-    for (int i = 0; i < 3; ++i) {
+static void integrate(int32_t integral[INTEGRAL], union activations *x) {
+    int32_t p[INTEGRAL], inside = (int32_t)1 << 30; /* 1 - |p|^2 / radius^2, in 1 / 2^30 */
+    for (int i = 0; i < INTEGRAL; ++i) {
         p[i] = (int32_t)x->one[axes[i].input] - OFFSET;
         x->one[axes[i].input] = (activation)(shifted(p[i], axes[i].shift) + OFFSET);
         const int32_t v = shifted(p[i] * axes[i].inverse_radius, axes[i].inverse_radius_shift);
@@ -361,7 +361,7 @@ static void integrate(int32_t integral[3], union activations *x) {
     }
     inside = inside > 0 ? inside >> 15 : 0;
     const int32_t gate = inside * inside >> 15; /* 2^15: open */
-    for (int i = 0; i < 3; ++i) {
+    for (int i = 0; i < INTEGRAL; ++i) {
         const int32_t more = shifted(scaled(p[i] * gate, axes[i].gain), axes[i].gain_shift);
         integral[i] = limited(integral[i] + more, -INTEGRAL_LIMIT, INTEGRAL_LIMIT);
     }
@@ -409,7 +409,9 @@ static int32_t quantised(uint32_t bits, const struct input *in) {
 
 void @name@_reset(@name@_state *state) {
 #if INTEGRAL
-    state->integral[0] = state->integral[1] = state->integral[2] = 0;
+    for (int i = 0; i < INTEGRAL; ++i) {
+        state->integral[i] = 0;
+    }
 #endif
 #if PREVIOUS_ACTION
     for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
@@ -477,7 +479,7 @@ static int differs(const @name@_state *state) {
     }
 #endif
 #if INTEGRAL
-    for (int i = 0; i < 3; ++i) {
+    for (int i = 0; i < INTEGRAL; ++i) {
         wrong |= state->integral[i] != golden_integral[i];
     }
 #endif
