@@ -65,7 +65,7 @@ def actions(task: Task) -> list[ActionPort]:
             frame="thrust along body z",
             offset=hover[i - 1],
             scale=vehicle.action_scale_N,
-            low=0.0,
+            low=motor.min_N,
             high=motor.max_N,
             safe=hover[i - 1],
             position_m=motor.position_m,

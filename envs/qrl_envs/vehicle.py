@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
@@ -20,8 +20,18 @@ LEAST_AXIS = 1e-3  # length
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover
 
 
+def _moments(inertia: tuple[float, ...]) -> tuple[float, ...]:
+    if len(inertia) not in (3, 6):
+        raise ValueError(f"expected 3 moments, or 3 moments and 3 products of inertia, found {len(inertia)} numbers")
+    if min(inertia[:3]) <= 0.0:
+        raise ValueError(f"expected moments greater than 0, found {min(inertia[:3]):g}")
+    return inertia
+
+
 class Motor(Spec):
-    position_m: tuple[Real, Real] | tuple[Real, Real, Real]  # x, y (, z) from the center of mass, body frame
+    position_m: Annotated[
+        tuple[Real, ...], Field(min_length=2, max_length=3)
+    ]  # x, y (, z) from the center of mass, body frame
     axis: tuple[Real, Real, Real] = (0.0, 0.0, 1.0)  # direction of its thrust, body frame, of any length
     spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about its axis
     max_N: Positive
@@ -47,7 +57,7 @@ class Vehicle(Spec):
     mass_kg: Positive
     # About the center of mass, body axes: xx, yy, zz, or xx, yy, zz, xy, xz, yz (the products as they stand in the
     # matrix, so xy is −∫xy dm).
-    inertia_kg_m2: tuple[Positive, Positive, Positive] | tuple[Positive, Positive, Positive, Real, Real, Real]
+    inertia_kg_m2: Annotated[tuple[Real, ...], AfterValidator(_moments)]
     motors: Annotated[tuple[Motor, ...], Field(min_length=3, max_length=8)]
     yaw_moment_m: Positive  # reaction torque per thrust: N m per N
     action_scale_N: Positive  # F_pi = action_scale_N · a

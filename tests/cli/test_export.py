@@ -158,7 +158,7 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
 @pytest.mark.parametrize("name", shipped_vehicles())
 def test_a_shipped_vehicle_is_named(name: str) -> None:
     """As the task that a run records has it, under whatever name that is."""
-    task = tasks.spec(tasks.task_record("hover", name))
+    task = tasks.spec(tasks.task_record("hover", {"vehicle": name}))
     assert isinstance(task, QuadrotorTask)
     assert vehicle_name(task) == name
     heavier = task.model_copy(

@@ -164,10 +164,9 @@ def stepped(trim: lqr.Trim, circling: bool, error: Array, action: Array) -> Arra
     position, velocity, turn, rate = np.split(error, 4)
     p, v, q, w, a = (np.asarray(x, np.float64) for x in trim)
     attitude = Rotation.from_quat(np.roll(q, -1)) * Rotation.from_rotvec(turn)
-    vehicle = jax.tree.map(lambda x: np.asarray(x, np.float64), quadrotor.physics(HOVER.vehicle))
     thrust = 0.667 * 9.81 / 4 + 6.0 * (a + action)
     flat = np.concatenate([p + position, v + velocity, w + rate, attitude.as_matrix().ravel()])
-    change = newton_euler(vehicle, thrust)(0.0, flat)
+    change = newton_euler(HOVER.vehicle, thrust)(0.0, flat)
     velocity, rate = v + velocity + DT_S * change[3:6], w + rate + DT_S * change[6:9]
     # A quaternion q + dt/2·q⊗ω, normalized, turns by 2·atan(dt/2·|ω|) about ω.
     by = 2.0 * np.arctan(DT_S / 2 * np.linalg.norm(rate)) * rate / max(np.linalg.norm(rate), 1e-12)

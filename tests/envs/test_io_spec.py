@@ -35,14 +35,14 @@ def test_actions_of_another_vehicle() -> None:
     """Its own motors, in its file's order, and its own hover thrust."""
     found = io_spec.actions(tasks.load("hover", "crazyflie"))
     assert [port.position_m for port in found] == [
-        (0.0325, 0.0325),
-        (-0.0325, 0.0325),
-        (-0.0325, -0.0325),
-        (0.0325, -0.0325),
+        (0.0304056, 0.0304056),
+        (0.0304056, -0.0304056),
+        (-0.0304056, -0.0304056),
+        (-0.0304056, 0.0304056),
     ]
     for port in found:
-        assert (port.scale, port.low, port.high) == (0.08, 0.0, 0.145)
-        assert port.safe == pytest.approx(0.028 * 9.81 / 4, rel=1e-3)
+        assert (port.scale, port.low, port.high) == (pytest.approx(0.03 * 9.81 / 4), 0.0, 0.14375)
+        assert port.safe == pytest.approx(0.03 * 9.81 / 4, rel=1e-3)
 
 
 def test_ports_of_the_pendulum() -> None:

@@ -138,7 +138,7 @@ def test_draws_fill_their_ranges_and_nothing_else_differs() -> None:
     """Uniform by Kolmogorov and Smirnov, directions over the sphere; what is no range stays."""
     spec = real_task("crazyflie")
     uncertainty = Uncertainty(
-        mass_factor=(0.8, 1.3),
+        mass_factor=(0.8, 1.1),
         rotor_lag_factor=(0.5, 2.0),
         force_weights=(0.0, 0.2),
         latency_s=(0.0, 0.02),
@@ -149,7 +149,7 @@ def test_draws_fill_their_ranges_and_nothing_else_differs() -> None:
     world = jax.tree.map(np.asarray, jax.jit(jax.vmap(lambda u: plant.draw(ranges, physics, u)))(u))
     weight = 0.03 * 9.81
     for found, low, width in (
-        (world.physics.mass_kg / 0.03, 0.8, 0.5),
+        (world.physics.mass_kg / 0.03, 0.8, 0.3),
         (world.rotors.rise_s, 0.036, 0.108),
         (np.linalg.norm(world.disturbance.force_N, axis=1) / weight, 0.0, 0.2),
         (world.latency_s, 0.0, 0.02),

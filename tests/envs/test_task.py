@@ -121,21 +121,35 @@ MISTAKES: dict[str, tuple[str | bytes, list[str]]] = {
     "zero mass": (hover('"vehicle": {"mass_kg": 0}'), ["'vehicle.mass_kg'", "greater than 0"]),
     "zero inertia": (
         hover('"vehicle": {"inertia_kg_m2": [0.1, 0, 0.1]}'),
-        ["'vehicle.inertia_kg_m2.1'", "greater than 0", "found 0"],
+        ["'vehicle.inertia_kg_m2'", "greater than 0", "found 0"],
     ),
     "inertia of no body": (
         hover('"vehicle": {"inertia_kg_m2": [0.001, 0.001, 0.003]}'),
         ["'vehicle'", "inertia_kg_m2", "rigid body", "0.003"],
     ),
-    "two moments": (hover('"vehicle": {"inertia_kg_m2": [0.1, 0.1]}'), ["'vehicle.inertia_kg_m2.2'", "missing"]),
+    "two moments": (
+        hover('"vehicle": {"inertia_kg_m2": [0.1, 0.1]}'),
+        ["'vehicle.inertia_kg_m2'", "3 moments", "found 2"],
+    ),
     "too weak motors": (
         hover(f'"vehicle": {{"motors": {motors(max_N="1.6")}}}'),
         ["'vehicle'", "motors that can lift", "6.4 N", "6.543 N"],
     ),
-    "three motors": (
-        hover('"vehicle": {"motors": [%s]}' % ", ".join([MOTOR % (1, 8)] * 3)),  # noqa: UP031
-        ["'vehicle.motors.3'", "missing"],
+    "two motors": (
+        hover('"vehicle": {"motors": [%s]}' % ", ".join([MOTOR % (1, 8)] * 2)),  # noqa: UP031
+        ["'vehicle.motors'", "3"],
     ),
+    "a lag of one way": (hover('"vehicle": {"rotor_rise_s": 0.05}'), ["'vehicle'", "rotor_fall_s", "both 0"]),
+    "an axis of no length": (
+        hover('"vehicle": {"motors": [%s]}' % ", ".join([MOTOR[:-1] % (1, 8) + ', "axis": [0, 0, 0]}'] * 4)),  # noqa: UP031
+        ["'vehicle.motors.0'", "axis"],
+    ),
+    "a range the wrong way round": (
+        hover('"uncertainty": {"mass_factor": [1.2, 0.8]}'),
+        ["'uncertainty.mass_factor'", "[least, greatest]", "1.2"],
+    ),
+    "an uncertainty of no name": (hover('"uncertainty": "defaul"'), ["'uncertainty'", "defaul"]),
+    "latency of a second": (hover('"uncertainty": {"latency_s": [0, 1]}'), ["'uncertainty'", "latency_s", "0.1"]),
     "five motors": (hover('"vehicle": {"motors": [%s]}' % ", ".join([MOTOR % (1, 8)] * 5)), ["motors"]),  # noqa: UP031
     "spin of two": (
         hover(f'"vehicle": {{"motors": {motors(spin="2")}}}'),
@@ -322,7 +336,7 @@ def test_a_task_names_its_vehicle_and_another_may_fly_it(path: Path) -> None:
     """By a shipped name, or a file beside the task's; the argument replaces the task's own."""
     crazyflie = task.load("circle", "crazyflie")
     assert isinstance(crazyflie, task.QuadrotorTask)
-    assert crazyflie.vehicle.mass_kg == 0.028
+    assert crazyflie.vehicle.mass_kg == 0.03
     (path.parent / "light.json").write_text(json.dumps({**SHIPPED["hover"]["vehicle"], "mass_kg": 0.5}))
     mine = load(path, hover('"vehicle": "light.json"'))
     assert isinstance(mine, task.QuadrotorTask)
@@ -331,6 +345,42 @@ def test_a_task_names_its_vehicle_and_another_may_fly_it(path: Path) -> None:
         task.load("hover", "crazyfly")
     with pytest.raises(BadInput, match="has no vehicle"):
         task.load("pendulum", "crazyflie")
+
+
+def test_a_real_vehicle_has_uncertainty_and_memory_unless_the_file_says_other(path: Path) -> None:
+    real = task.load("hover", "crazyflie")
+    assert isinstance(real, task.QuadrotorTask)
+    assert not real.ideal
+    assert real.memory == task.Memory(previous_action=True, integral=task.Integral())
+    assert real.uncertainty
+    assert real.uncertainty.mass_factor == (0.8, 1.3)
+    plain = load(path, hover('"vehicle": "crazyflie", "uncertainty": "none", "memory": {}'))
+    assert isinstance(plain, task.QuadrotorTask)
+    assert plain.uncertainty == type(real.uncertainty)()
+    assert plain.memory == task.Memory()
+    again = task.from_data(plain.model_dump(mode="json", exclude_none=True), "record")
+    assert again == plain
+    papers = task.load("hover")
+    assert isinstance(papers, task.QuadrotorTask)
+    assert papers.ideal
+    with pytest.raises(BadInput, match="unknown uncertainty 'non'"):
+        task.load("hover", uncertainty="non")
+
+
+@pytest.mark.parametrize("motors", [6, 4], ids=["hexarotor", "tilted"])
+def test_other_multirotors_hover(motors: int, path: Path) -> None:
+    """Six motors; four that are all tilted forward, which hover tilted backward by as much."""
+    axis = [0.17, 0.0, 0.98] if motors == 4 else [0.0, 0.0, 1.0]
+    angles = np.pi / motors * (2 * np.arange(motors) + 1)
+    made = [
+        {"position_m": [0.2 * np.cos(a), 0.2 * np.sin(a)], "spin": (-1) ** i, "max_N": 7.0, "axis": axis}
+        for i, a in enumerate(angles)
+    ]
+    vehicle = {"mass_kg": 1.3, "inertia_kg_m2": [0.012, 0.014, 0.02], "motors": made, "yaw_moment_m": 0.015}
+    (path.parent / "other.json").write_text(json.dumps(vehicle))
+    found = load(path, hover('"vehicle": "other.json"'))
+    assert isinstance(found, task.QuadrotorTask)
+    np.testing.assert_allclose(found.vehicle.hover_thrusts_N, 1.3 * 9.81 / motors, rtol=1e-6)
 
 
 def test_a_vehicles_action_scale_reaches_its_farther_limit(path: Path) -> None:
