@@ -91,7 +91,7 @@ def test_task_vehicle_config_seed_and_out_are_positional(asked: list[Any]) -> No
 
 
 def test_a_vehicle_flies_the_task(asked: list[Any]) -> None:
-    assert planned(asked, "circle", "crazyflie").task.spec["vehicle"]["mass_kg"] == 0.028
+    assert planned(asked, "circle", "crazyflie").task.spec["vehicle"]["mass_kg"] == 0.03
     assert asked[-1].out == Path("runs/circle_crazyflie")
 
 

@@ -84,7 +84,7 @@ class CircleReward(Spec):
         return self
 
 
-FULL_MEMORY = {"previous_action": True, "integral": {}}
+LAGGED = "with_lag"  # key of a task file: what else it says where its vehicle has rotors that lag, or drag
 W5_RADIUS_S_M = 0.5  # w5 of the 1 m circle
 
 FlightReward = Annotated[HoverReward | CircleReward, Field(discriminator="form")]
@@ -129,8 +129,8 @@ class QuadrotorTask(Spec):
     control_period_s: Positive
     episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
-    uncertainty: Uncertainty | None = None  # in a file by default "default" for a vehicle with lag or drag
-    memory: Memory = Memory()  # in a file by default all of it for such a vehicle
+    uncertainty: Uncertainty | None = None
+    memory: Memory = Memory()
     start: FlightStart
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
     bounds: Bounds
@@ -289,6 +289,16 @@ def from_data(
     `parts`, names or paths by key, replace them.
     """
     data = extended(data, where)
+    lagged = data.pop(LAGGED, {})
+    data = _with_parts(data, where, folder, parts)
+    if _lags(data.get("vehicle")):
+        left = {key: value for key, value in lagged.items() if parts.get(key) is None}
+        data = _with_parts(specfile.merge(data, left), where, folder, {})
+    return specfile.build(_ANY_TASK, _completed(data), where)
+
+
+def _with_parts(data: dict[str, Any], where: str, folder: Path, parts: Mapping[str, str | None]) -> dict[str, Any]:
+    """`data` with its parts read from their files."""
     for key, (read, known) in _PARTS.items():
         if (asked := parts.get(key)) is not None:
             if data.get("world") != "quadrotor":
@@ -300,7 +310,7 @@ def from_data(
                 data = {**data, key: read(named if named in known() else str(folder / named))}
             except BadInput as error:
                 raise BadInput(f"{where}: key '{key}': {error}") from None
-    return specfile.build(_ANY_TASK, _completed(data), where)
+    return data
 
 
 def _positive(value: Any) -> bool:
@@ -321,17 +331,23 @@ def _completed(data: dict[str, Any]) -> dict[str, Any]:
         reward: Any = part.get("reward") if isinstance(part, dict) else None
         if isinstance(part, dict) and isinstance(reward, dict) and _positive(reward.get("radius_m")):
             part["reward"] = {"w5_direction_s_m2": W5_RADIUS_S_M / reward["radius_m"]} | reward
-    if "vehicle" not in data:
-        return data
-    vehicle = with_default_scale(data["vehicle"])
-    data |= {"vehicle": vehicle}
-    if isinstance(vehicle, dict) and (vehicle.get("rotor_rise_s") or any(_listed(vehicle.get("drag_N_s_m")))):
-        data = {"uncertainty": uncertainty_data("default"), "memory": FULL_MEMORY} | data
-    return data
+    return data | {"vehicle": with_default_scale(data["vehicle"])} if "vehicle" in data else data
 
 
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else []
+def _lags(vehicle: Any) -> bool:
+    """Whether a vehicle object has rotors that lag, or drag."""
+    if not isinstance(vehicle, dict):
+        return False
+    drag = vehicle.get("drag_N_s_m")
+    return bool(vehicle.get("rotor_rise_s")) or (isinstance(drag, list) and any(drag))
+
+
+def _without(lagged: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
+    """`lagged` without what a file that extends the task gives itself; of a reward, weight by weight."""
+    left = {key: value for key, value in lagged.items() if key not in given or key == "reward"}
+    if isinstance(reward := given.get("reward"), dict) and "reward" in left:
+        left["reward"] = {key: value for key, value in left["reward"].items() if key not in reward}
+    return left
 
 
 def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
@@ -341,4 +357,7 @@ def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
     base = data["extend"]
     if base not in shipped():
         raise BadInput(f"{where}: key 'extend': no shipped task '{base}'{specfile.nearest(str(base), shipped())}")
-    return specfile.merge(_shipped(base), {key: value for key, value in data.items() if key != "extend"})
+    shipped_base = _shipped(base)
+    given = {key: value for key, value in data.items() if key != "extend"}
+    lagged = specfile.merge(_without(shipped_base.get(LAGGED, {}), given), given.get(LAGGED, {}))
+    return specfile.merge(shipped_base, given) | ({LAGGED: lagged} if lagged else {})

@@ -15,7 +15,7 @@ import numpy as np
 
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.types import Env
-from qrl.config import Config, load_preset, preset_names
+from qrl.config import Config, load_preset
 from qrl.runs.record import RunConfig, TaskRecord, with_current_names
 from qrl_envs import env as worlds
 from qrl_envs import specfile
@@ -147,12 +147,8 @@ def task_preset(record: TaskRecord, where: str, name: str | None = None) -> dict
     """The learner's defaults for a task, which `where` names: its preset, or that of `name`, carried over to it."""
     if record.spec is None:
         return preset(name or "default", where)
-    task = spec(record)
-    named = record.spec["preset"]
-    if isinstance(task, task_spec.QuadrotorTask) and not task.ideal and f"{named}_real" in preset_names():
-        named = f"{named}_real"
-    values = preset(name or named, where if name else f"{where}: the task's key 'preset'")
-    return _carried_over(values, task)
+    values = preset(name or record.spec["preset"], where if name else f"{where}: the task's key 'preset'")
+    return _carried_over(values, spec(record))
 
 
 def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any]:
