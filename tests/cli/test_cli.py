@@ -90,15 +90,16 @@ def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixtur
         for name, baseline in result["baselines"].items():
             there = baseline.pop("off_nominal")
             assert there.keys() == off.keys()
-            assert len({each["return_mean"] for each in (baseline, *there.values())}) == 5, name
+            assert len({each["return_mean"] for each in (baseline, *there.values())}) > 10, name
         assert result == before
         assert result["baselines"].keys() == {"geometric", "lqr"}
-        assert off.keys() == {"rk4", "latency", "noise", "together"}
-        assert len({each["return_mean"] for each in (result, *off.values())}) == 5
+        assert {"exact", "lag_72ms", "latency", "mass_x1.3", "noise", "together"} < off.keys()
+        assert len({each["return_mean"] for each in (result, *off.values())}) > 10
         assert f"seed {i}," in said
-    assert said.count("nominal         rk4     latency       noise    together") == 4  # two seeds, two controllers
+    assert said.count("\nlag_72ms ") == 4  # two seeds, two controllers
     assert "seed 0      seed 1   geometric         lqr" in said
-    assert (run / "seed-0" / "settle.png").exists()
+    for picture in ("settle.png", "off_nominal.png"):
+        assert (run / "seed-0" / picture).exists()
 
 
 def test_evaluate_flies_other_runs_beside(

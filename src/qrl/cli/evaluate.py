@@ -19,7 +19,7 @@ from qrl.runs import checkpoint, files, record
 from qrl.runs.record import RunConfig
 from qrl_envs import measures
 from qrl_envs.off_nominal import Condition, OffNominal, conditions
-from qrl_envs.plots import errors, settle
+from qrl_envs.plots import errors, off_nominal, settle
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task
 
@@ -62,6 +62,10 @@ def evaluate(args: argparse.Namespace) -> int:
         files.write_json(seed.folder / "evaluation.json", result)
         if task:
             _draw(seed.folder, task, flights, comparison)
+        if task and named:
+            by_pilot = {"policy": result, **comparison.baselines}
+            with files.writing(seed.folder / "off_nominal.png"):
+                off_nominal.draw(seed.folder / "off_nominal.png", task, by_pilot)
     if config.seeds > 1:
         files.write_json(args.run / "evaluation.json", table)
     console.print(f"{config.task.name}: {args.starts:,} fresh starts, deterministic policy")

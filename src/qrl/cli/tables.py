@@ -32,9 +32,15 @@ def checkpoints(result: dict[str, Any]) -> None:
 
 
 def off_nominal(title: str, result: dict[str, Any]) -> None:
+    """One row per condition, one column per number."""
     console.print(f"\n{title}")
-    nominal = {name: result[name] for name in next(iter(result["off_nominal"].values()))}
-    table({"nominal": nominal, **result["off_nominal"]})
+    rows = {"nominal": {name: result[name] for name in next(iter(result["off_nominal"].values()))}}
+    rows |= result["off_nominal"]
+    names = [name for name, x in rows["nominal"].items() if not math.isnan(x)]
+    corner = max(map(len, rows))
+    console.print(" ".join([f"{'':<{corner}}", *names]))
+    for condition, one in rows.items():
+        console.print(" ".join([f"{condition:<{corner}}", *(f"{_cell(name, one):>{len(name)}}" for name in names)]))
 
 
 def failures(name: str, result: dict[str, Any]) -> None:
