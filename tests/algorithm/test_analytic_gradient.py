@@ -432,3 +432,45 @@ def test_presets_with_apg_say_so_in_whole_unrolls() -> None:
                 config.apg_num_envs * config.apg_episode_length
                 == config.unrolls_per_apg_update * config.steps_per_unroll
             )
+
+
+class Growing(Env):
+    """A number that grows by half at each step, and is pushed. Reward −x²."""
+
+    observation_size, action_size, backend = 1, 1, "test"  # pyright: ignore[reportAssignmentType]
+
+    def reset(self, rng: jax.Array) -> State:
+        return self._at(0.01 * jax.random.normal(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return self._at(1.5 * state.pipeline_state + 0.3 * action[0])
+
+    def _at(self, x: jax.Array) -> State:
+        return State(x, x[None], -(x**2), jnp.zeros(()))
+
+
+@pytest.mark.parametrize("limit", [1e-3, 0.1, 1e9])
+def test_the_gradient_with_respect_to_a_state_is_cut(limit: float) -> None:
+    """At each step and for each flight by itself, as in a literal reverse pass; what is not above the limit stays."""
+    steps, gain, keys = 8, 0.4, jax.random.split(jax.random.PRNGKey(0), 5)
+
+    def total(k: jax.Array) -> jax.Array:
+        values, _ = analytic_gradient.returns(
+            Growing(), linear(k[None]), jnp.float32(0.0), keys, steps, jnp.float32(limit)
+        )
+        return values.sum()
+
+    ours = float(jax.grad(total)(jnp.float32(gain)))
+    expected = 0.0
+    for key in keys:
+        x = [float(Growing().reset(jax.random.split(key)[0]).pipeline_state)]
+        for _ in range(steps):
+            x.append(1.5 * x[-1] + 0.3 * gain * x[-1])
+        assert max(map(abs, x)) * gain < 1.0  # no action is clipped
+        of_state = of_observation = 0.0
+        for t in range(steps, 0, -1):
+            cut = of_state * min(1.0, limit / max(abs(of_state), 1e-12))
+            raw = cut + of_observation - 2.0 * x[t]
+            expected += raw * 0.3 * x[t - 1]
+            of_state, of_observation = 1.5 * raw, 0.3 * gain * raw
+    assert ours == pytest.approx(expected, rel=1e-4)

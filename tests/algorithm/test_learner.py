@@ -182,7 +182,8 @@ def traced() -> tuple[Hyperparameters, object]:
     return here.hyperparameters, decided
 
 
-@pytest.mark.parametrize("name", Hyperparameters._fields)
+# The bound on cotangents is an argument of the flights (test_analytic_gradient).
+@pytest.mark.parametrize("name", [name for name in Hyperparameters._fields if name != "apg_cotangent_norm"])
 def test_a_traced_hyperparameter_is_an_argument_of_the_program(traced: tuple, name: str) -> None:
     """One compiled program, another value: another result. (None that is declared traced is a constant in it.)"""
     values, decided = traced
@@ -203,3 +204,23 @@ def test_other_values_make_the_learner_that_has_them(traced: tuple) -> None:
     there, data = BoundLearner(config(**changes), F, A), batch()
     here = BoundLearner(config(), F, A).with_hyper(there.config.hyperparameters)
     np.testing.assert_array_equal(losses(here, data), losses(there, data))
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_the_policy_sees_the_first_numbers_and_the_critic_all(normalize: bool) -> None:
+    """A change of what only a critic may see changes values and targets, not the mean; the policy is as wide as what it
+    sees, and a deployed one needs no more.
+    """
+    scale = [1.0, 2.0, 3.0, 4.0, 5.0]
+    learner = BoundLearner(config(normalize_observations=normalize, observation_scale=scale), F, A, None, 3)
+    data = batch()
+    state = begin(learner, data)
+    assert state.params.policy["params"]["Dense_0"]["kernel"].shape[0] == 3
+    assert state.params.critic["params"]["Dense_0"]["kernel"].shape[0] == F
+    hidden = data._replace(observation=data.observation.at[..., 3:].add(1.0))
+    mean = learner.mean(state, data.observation)
+    np.testing.assert_array_equal(learner.mean(state, hidden.observation), mean)
+    np.testing.assert_array_equal(learner.mean(state, data.observation[..., :3]), mean)
+    assert np.abs(learner.mean(state, data.observation.at[..., :3].add(1.0)) - mean).max() > 1e-4
+    values = [losses(learner, x) for x in (data, hidden)]
+    assert values[0][1] != values[1][1]

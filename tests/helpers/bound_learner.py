@@ -9,9 +9,16 @@ from qrl.config import Config, Hyperparameters
 
 
 class BoundLearner:
-    def __init__(self, config: Config, observation_size: int, action_size: int, axis: str | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        observation_size: int,
+        action_size: int,
+        axis: str | None = None,
+        policy_observation_size: int | None = None,
+    ) -> None:
         self.config = config
-        self.spec = LearnerSpec(config, observation_size, action_size, axis)
+        self.spec = LearnerSpec(config, observation_size, action_size, axis, policy_observation_size)
         self.planned_updates = config.planned_updates(config.learning_unrolls)
         self.policy, self.critic = self.spec.policy, self.spec.critic
         self._bind(config.hyperparameters)
