@@ -448,7 +448,10 @@ SOURCE_FAULTS = {
     "the gate is always open": ("inside * inside >> 15", "32768"),
     "no limit": ("limited(integral[i] + more, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)", "integral[i] + more"),
     "rounded down": ("(x + ((int32_t)1 << shift >> 1)) >> shift", "x >> shift"),
-    "a reset of two axes": ("= state->integral[2] = 0", "= 0"),
+    "a reset of two axes": (
+        "for (int i = 0; i < INTEGRAL; ++i) {\n        state->integral[i] = 0;",
+        "for (int i = 0; i < INTEGRAL - 1; ++i) {\n        state->integral[i] = 0;",
+    ),
     "integrated before it is complete": (
         "        status |= put(&a, i, quantised",
         "        state->integral[0] += 1;\n        status |= put(&a, i, quantised",

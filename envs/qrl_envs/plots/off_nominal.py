@@ -35,6 +35,8 @@ def figure(task: Task, results: Mapping[str, Any]) -> Figure:
         steady.plot(np.maximum(values[settled], LEAST_M), at[settled], "o", color=COLORS[i], label=label)
     success.set(xlabel="success [%]", xlim=(0.0, 100.0), yticks=rows, yticklabels=names)
     success.invert_yaxis()
+    most = max([LEAST_M, *(x for line in steady.lines for x in line.get_xdata())])
+    steady.set(xlim=(LEAST_M / 2, 2 * most))  # before the scale, which needs a positive limit where nothing settled
     steady.set(xlabel=f"{error.removeprefix('rms_')}, RMS in the steady state", xscale="log")
     for axes, title in ((success, "flights that succeed"), (steady, "error where half of the flights or more succeed")):
         finish(axes, title)
