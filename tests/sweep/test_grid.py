@@ -36,7 +36,7 @@ def test_every_hyperparameter_is_declared_traced_or_static() -> None:
     config = Config.model_validate(tasks.task_preset(tasks.task_record("hover"), ""), strict=False)
     traced = {name for name, field in Config.model_fields.items() if "traced" in field.metadata}
     assert traced == set(Hyperparameters._fields)
-    assert {name for name, x in config.hyperparameters._asdict().items() if x is None} == {"xi"}
+    assert {name for name, x in config.hyperparameters._asdict().items() if x is None} == {"xi", "apg_cotangent_norm"}
     assert not set(config.static) & traced
 
 
