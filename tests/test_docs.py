@@ -81,6 +81,8 @@ def test_commands_exist(line: str) -> None:
             "RUN",
             "GRID",
             "FAST",
+            "NAME",
+            "UNCERTAINTY",
             "PYTHON",
         }
         assert set(variables) <= known

@@ -60,7 +60,7 @@ class DeployedPolicy:
 
     def apply(self, memory: Any, observation: chex.Array) -> tuple[Any, chex.Array]:
         """Next memory and action; [..., F] -> [..., A]."""
-        return memory, jnp.clip(self._run.policy_mean(observation), -1.0, 1.0)
+        return memory, jnp.clip(self._run.policy_mean(jnp.asarray(observation)), -1.0, 1.0)
 
 
 class Run:
