@@ -15,6 +15,7 @@ define HELP
   make tasks                         list the tasks that TASK may name
   make train TASK=circle             train, and leave a run folder
        SEED=0 SEEDS=1                  the first seed; how many to train in one program
+       VEHICLE=crazyflie               what flies it: a shipped name, or a .json of yours
        UNCERTAINTY=default             what differs from flight to flight: a shipped name, or a .json of yours
        OUT=runs/circle                 the run folder
        RESUME=1                        resume that run from its last checkpoint
