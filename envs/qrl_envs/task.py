@@ -291,6 +291,7 @@ def from_data(
     data = extended(data, where)
     lagged = data.pop(LAGGED, {})
     data = _with_parts(data, where, folder, parts)
+    where += "".join(f" with {key} {asked}" for key, asked in parts.items() if asked is not None)
     if _lags(data.get("vehicle")):
         left = {key: value for key, value in lagged.items() if parts.get(key) is None}
         data = _with_parts(specfile.merge(data, left), where, folder, {})
@@ -304,7 +305,6 @@ def _with_parts(data: dict[str, Any], where: str, folder: Path, parts: Mapping[s
             if data.get("world") != "quadrotor":
                 raise BadInput(f"{where}: has no {key} to replace by '{asked}'")
             data = {**data, key: read(asked)}
-            where = f"{where} with {key} {asked}"
         elif isinstance(named := data.get(key), str):
             try:
                 data = {**data, key: read(named if named in known() else str(folder / named))}

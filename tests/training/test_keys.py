@@ -76,9 +76,9 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Seen:
         seen.value("symmetry", draws)
         return original_augment(env, batch, draws)
 
-    def returns(env: Any, mean: Any, sigma: Any, keys: Any, steps: int) -> Any:
+    def returns(env: Any, mean: Any, sigma: Any, keys: Any, *more: Any) -> Any:
         seen.value("start", jax.vmap(lambda key: original_uniform(original_split(key)[0], (2,)))(keys))
-        return original_returns(env, mean, sigma, keys, steps)
+        return original_returns(env, mean, sigma, keys, *more)
 
     original_unroll, original_gather, original_augment = rollout.unroll, replay_buffer.gather, augmentation.augment
     original_returns = trainer.analytic_gradient.returns
