@@ -115,6 +115,7 @@ class Config(BaseModel):
     apg_num_envs: Static[Count] = Field(description="flights of one APG update")
     apg_episode_length: Static[Count] = Field(description="steps of one APG flight")
     apg_cotangent_norm: Traced[Positive | None] = Field(
+        default=None,  # configurations written before it was there had none
         description="norm at which the gradient of a flight's return with respect to its state is cut at each step;"
         " null: none"
     )
