@@ -130,7 +130,7 @@ class QuadrotorTask(Spec):
     episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
     uncertainty: Uncertainty | None = None
-    memory: Memory = Memory()
+    memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `vehicle.Later`
     start: FlightStart
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
     bounds: Bounds

@@ -115,9 +115,10 @@ class Config(BaseModel):
     apg_num_envs: Static[Count] = Field(description="flights of one APG update")
     apg_episode_length: Static[Count] = Field(description="steps of one APG flight")
     apg_cotangent_norm: Traced[Positive | None] = Field(
-        default=None,  # configurations written before it was there had none
+        default=None,
+        exclude_if=lambda x: x is None,  # a run of before it was there has the same fingerprint
         description="norm at which the gradient of a flight's return with respect to its state is cut at each step;"
-        " null: none"
+        " null: none",
     )
     apg_learning_rate: Traced[Positive] = Field(description="initial step size of APG; decays to 0, as sigma then does")
 

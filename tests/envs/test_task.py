@@ -411,3 +411,14 @@ def test_circles_of_any_size_and_sense(path: Path) -> None:
 def test_bounds_within_the_starts_are_refused(path: Path) -> None:
     with pytest.raises(BadInput, match=r"bounds\.distance_m beyond the starts"):
         load(path, hover('"bounds": {"distance_m": 1.5}'))
+
+
+def test_an_ideal_vehicle_is_written_as_it_was_before_it_could_lag(path: Path) -> None:
+    """So runs of before keep their fingerprint; what lags is written whole."""
+    written = task.load("hover").model_dump(mode="json", exclude_none=True)
+    assert written["vehicle"].keys() == {"mass_kg", "inertia_kg_m2", "motors", "yaw_moment_m", "action_scale_N"}
+    assert written["vehicle"]["motors"][0].keys() == {"position_m", "spin", "max_N"}
+    assert "memory" not in written
+    drag = load(path, hover('"vehicle": {"drag_N_s_m": [0.0, 0.0, 1.0]}')).model_dump(mode="json", exclude_none=True)
+    assert drag["vehicle"]["drag_N_s_m"] == [0.0, 0.0, 1.0]
+    assert drag["memory"]["previous_action"]
