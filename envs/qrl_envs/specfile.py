@@ -5,6 +5,7 @@ The pydantic models of tasks and presets derive from `Spec`; `read` and `build` 
 
 import difflib
 import json
+from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -78,6 +79,26 @@ def read(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise BadInput(f"{path}: expected a JSON object, found {type(data).__name__}")
     return data
+
+
+def _folder(name: str) -> Any:
+    return resources.files("qrl_envs").joinpath(name)
+
+
+def shipped(folder: str) -> list[str]:
+    """Names of the files that ship in a folder of the package."""
+    return sorted(
+        entry.name.removesuffix(".json") for entry in _folder(folder).iterdir() if entry.name.endswith(".json")
+    )
+
+
+def named(what: str, folder: str, name_or_path: str) -> dict[str, Any]:
+    """The contents of a file that ships in `folder`, or of a `.json`; BadInput with one line if there is none."""
+    if name_or_path in shipped(folder):
+        return read(Path(str(_folder(folder).joinpath(f"{name_or_path}.json"))))
+    if not name_or_path.endswith(".json"):
+        raise BadInput(f"unknown {what} '{name_or_path}'{nearest(name_or_path, shipped(folder))}")
+    return read(Path(name_or_path))
 
 
 def merge(base: dict[str, Any], over: dict[str, Any]) -> dict[str, Any]:

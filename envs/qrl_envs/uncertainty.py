@@ -2,14 +2,12 @@
 sensors err. `plant` draws from it.
 """
 
-from importlib import resources
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.specfile import BadInput, NonNegative, Positive, Spec
+from qrl_envs.specfile import NonNegative, Positive, Spec
 
 MOST_LATENCY_S = 0.1
 
@@ -52,19 +50,11 @@ class Uncertainty(Spec):
         return self
 
 
-def _folder() -> Any:
-    return resources.files("qrl_envs").joinpath("uncertainties")
-
-
 def shipped_uncertainties() -> list[str]:
     """Names of the shipped uncertainties."""
-    return sorted(entry.name.removesuffix(".json") for entry in _folder().iterdir() if entry.name.endswith(".json"))
+    return specfile.shipped("uncertainties")
 
 
 def uncertainty_data(name_or_path: str) -> dict[str, Any]:
     """The contents of a shipped uncertainty's file or of a `.json`; BadInput with one line if there is none."""
-    if name_or_path in shipped_uncertainties():
-        return specfile.read(Path(str(_folder().joinpath(f"{name_or_path}.json"))))
-    if not name_or_path.endswith(".json"):
-        raise BadInput(f"unknown uncertainty '{name_or_path}'{specfile.nearest(name_or_path, shipped_uncertainties())}")
-    return specfile.read(Path(name_or_path))
+    return specfile.named("uncertainty", "uncertainties", name_or_path)

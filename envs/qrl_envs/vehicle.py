@@ -1,14 +1,12 @@
 """Vehicle files: what flies, whether it can, and what it can do. Body frame: x forward, y left, z up; SI units."""
 
-from importlib import resources
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
+from qrl_envs.specfile import NonNegative, Positive, Real, Spec
 
 STANDARD_GRAVITY_M_S2 = 9.81
 INERTIA_TOLERANCE = 0.05  # measured inertias are rounded: excess over a rigid body's bound that is accepted
@@ -230,13 +228,9 @@ def with_default_scale(data: Any) -> Any:
         return data
 
 
-def _folder() -> Any:
-    return resources.files("qrl_envs").joinpath("vehicles")
-
-
 def shipped_vehicles() -> list[str]:
     """Names of the shipped vehicles."""
-    return sorted(entry.name.removesuffix(".json") for entry in _folder().iterdir() if entry.name.endswith(".json"))
+    return specfile.shipped("vehicles")
 
 
 def vehicle_data(name_or_path: str) -> dict[str, Any]:
@@ -244,9 +238,5 @@ def vehicle_data(name_or_path: str) -> dict[str, Any]:
 
     A `.json` that holds a task is read for its key 'vehicle'.
     """
-    if name_or_path in shipped_vehicles():
-        return specfile.read(Path(str(_folder().joinpath(f"{name_or_path}.json"))))
-    if not name_or_path.endswith(".json"):
-        raise BadInput(f"unknown vehicle '{name_or_path}'{specfile.nearest(name_or_path, shipped_vehicles())}")
-    data = specfile.read(Path(name_or_path))
+    data = specfile.named("vehicle", "vehicles", name_or_path)
     return data["vehicle"] if isinstance(data.get("vehicle"), dict) else data
