@@ -125,17 +125,21 @@ class TaskEnv(abc.ABC):
         task's parameters, which are constants of a flight.
         """
         lane: Lane = state.pipeline_state
-        lane = lane._replace(params=jax.lax.stop_gradient(lane.params))
+        given, lane = lane, lane._replace(params=jax.lax.stop_gradient(lane.params))
         x, reward = self._advance(lane.params, lane.x, action)
         out = self._out_of_bounds(lane.params, x)
         reward, done = jnp.where(out, self._reward_out_of_bounds(lane.params), reward), out.astype(jnp.float32)
         return state.replace(
-            pipeline_state=Lane(x, lane.params),
+            pipeline_state=Lane(x, given.params),
             obs=self._observe(lane.params, x),
             reward=reward,
             done=done,
             info={**state.info, "truncated": done, "out_of_bounds": done},
         )
+
+    def step_lanes(self, state: State, action: chex.Array) -> State:
+        """`step` of many lanes, which lie along the last axis of every leaf: so a CPU takes vectors of lanes."""
+        return self.step(state, action)
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         """The random symmetry of the task that u [2] selects, uniform in [0, 1)."""
@@ -208,8 +212,8 @@ class QuadrotorEnv(TaskEnv):
         return quadrotor.observe(x)
 
     def _out_of_bounds(self, params: Params, x: Any) -> chex.Array:
-        position_ok = jnp.linalg.norm(x.pose.position_m) <= params.bounds["distance_m"]
-        rate_ok = jnp.linalg.norm(x.twist.body_rate_rad_s) <= params.bounds["body_rate_rad_s"]
+        position_ok = jnp.linalg.norm(x.pose.position_m, axis=0) <= params.bounds["distance_m"]
+        rate_ok = jnp.linalg.norm(x.twist.body_rate_rad_s, axis=0) <= params.bounds["body_rate_rad_s"]
         return ~(position_ok & rate_ok)  # negated, so that a NaN ends the episode too
 
     def _reward_out_of_bounds(self, params: Params) -> chex.Array:
@@ -218,10 +222,12 @@ class QuadrotorEnv(TaskEnv):
         The same whichever bound was left. If an end paid the reward of the state in which it came, tumbling at once,
         near the origin, would cost a tenth of any flight that a policy can make before it has learned to fly.
         """
-        above = jnp.zeros(3).at[2].set(params.bounds["distance_m"])
-        upside_down = jnp.array([0.0, 1.0, 0.0, 0.0])
-        at_rest = quadrotor.Twist(jnp.zeros(3), jnp.zeros(3))
-        return params.reward(quadrotor.Body(quadrotor.Pose(above, upside_down), at_rest), jnp.ones(self.action_size))
+        distance_m = params.bounds["distance_m"]
+        zero, one = jnp.zeros_like(distance_m), jnp.ones_like(distance_m)
+        rest = jnp.stack([zero] * 3)
+        above, upside_down = jnp.stack([zero, zero, distance_m]), jnp.stack([zero, one, zero, zero])
+        body = quadrotor.Body(quadrotor.Pose(above, upside_down), quadrotor.Twist(rest, rest))
+        return params.reward(body, jnp.stack([one] * self.action_size))
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         draw = symmetry.circle if self.task.reward.form == "circle" else symmetry.hover
@@ -288,8 +294,9 @@ class RealQuadrotorEnv(QuadrotorEnv):
         )
 
     def _advance(self, params: Params, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
-        x = x._replace(world=jax.lax.stop_gradient(x.world))
-        flight = plant.step(x, action, self._integrator, self.task.control_period_s)
+        world = x.world
+        x = x._replace(world=jax.lax.stop_gradient(world))
+        flight = plant.step(x, action, self._integrator, self.task.control_period_s)._replace(world=world)
         return flight, params.reward(flight.body, flight.previous_action)
 
     def _observe(self, params: Params, x: plant.Flight) -> chex.Array:

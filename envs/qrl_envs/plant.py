@@ -200,7 +200,7 @@ def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s
     # Set-point i acts from latency_s − i·dt_s on; before that, set-point i + 1.
     first = jnp.floor(world.latency_s / dt_s + 1e-4)
     late_s = jnp.maximum(world.latency_s - first * dt_s, 0.0)
-    ages = jnp.arange(set_points.shape[0])[:, None]
+    ages = jnp.arange(set_points.shape[0]).reshape(-1, *[1] * (set_points.ndim - 1))
     new = jnp.sum(jnp.where(ages == first, set_points, 0.0), axis=0)
     old = jnp.sum(jnp.where(ages == jnp.minimum(first + 1, set_points.shape[0] - 1), set_points, 0.0), axis=0)
 
@@ -240,7 +240,7 @@ def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s
 def _renormalized(body: Body) -> Body:
     """`body` with a unit quaternion, and body rates saturated at MOST_BODY_RATE_RAD_S."""
     rate = body.twist.body_rate_rad_s
-    square = jnp.sum(rate * rate)
+    square = jnp.sum(rate * rate, axis=0)
     over = square > MOST_BODY_RATE_RAD_S**2
     rate = rate * jnp.where(over, MOST_BODY_RATE_RAD_S * jax.lax.rsqrt(jnp.where(over, square, 1.0)), 1.0)
     return Body(
@@ -252,8 +252,9 @@ def integrated(total: chex.Array, position_m: chex.Array, integrator: Integrator
     """The integral [k] after a period at `position_m` [3] (`task.Integral`)."""
     if integrator is None:
         return total
-    error = jnp.stack([position_m[axis] for axis in integrator.axes])
-    near = jnp.maximum(0.0, 1.0 - jnp.sum(error**2) / integrator.radius_m**2)
+    coordinates = jnp.unstack(position_m)
+    error = jnp.stack([coordinates[axis] for axis in integrator.axes])
+    near = jnp.maximum(0.0, 1.0 - jnp.sum(error**2, axis=0) / integrator.radius_m**2)
     return jnp.clip(total + dt_s * error * near**2, -integrator.limit_m_s, integrator.limit_m_s)
 
 
@@ -270,10 +271,11 @@ def sense(world: World, body: Body, steps: chex.Array) -> Body:
     # A prime stride and a random start, so that flights do not share pairs of rows at the same distance.
     start = (world.noise_row * NOISE_ROWS).astype(jnp.int32)
     stride = 2 * (world.noise_stride * 1000).astype(jnp.int32) + 1
-    row = jnp.asarray(NOISE_TABLE)[(start + steps * stride) % NOISE_ROWS].reshape(4, 3)
+    row = jnp.asarray(NOISE_TABLE)[(start + steps * stride) % NOISE_ROWS]
+    row = jnp.moveaxis(row, -1, 0).reshape(4, 3, *steps.shape)
     noise = world.noise
     # A small-angle quaternion, normalized: a rotation exactly, its angle to 1e-5 of itself.
-    small = rotation.normalize(jnp.concatenate([jnp.ones(1), noise.attitude_rad / 2 * row[2]]))
+    small = rotation.normalize(jnp.concatenate([jnp.ones_like(row[2, :1]), noise.attitude_rad / 2 * row[2]]))
     (p, q), (v, w) = body
     return Body(
         Pose(p + world.position_bias_m + noise.position_m * row[0], rotation.product(q, small)),
@@ -287,6 +289,12 @@ def observe(flight: Flight, previous_action: bool) -> chex.Array:
     return jnp.concatenate([quadrotor.observe(flight.sensed), *memory])
 
 
+def _inertia(physics: Physics) -> chex.Array:
+    """The mean of the numbers of the inertia []."""
+    inertia = physics.inertia_kg_m2
+    return jnp.mean(inertia, axis=tuple(range(inertia.ndim - physics.mass_kg.ndim)))
+
+
 PRIVILEGED = 14  # numbers of `privileged`, besides one for each motor
 
 
@@ -296,14 +304,16 @@ def privileged(flight: Flight, nominal: Physics, dt_s: float) -> chex.Array:
     """
     world = flight.world
     weight_N = nominal.mass_kg * nominal.gravity_m_s2
-    drag = jnp.mean(world.disturbance.drag_N_s_m)
+    drag = jnp.mean(world.disturbance.drag_N_s_m, axis=0)
     push = world.disturbance.force_N + drag * world.disturbance.wind_m_s
-    roll = jnp.min(jnp.sum(jnp.abs(nominal.motor_torque_m[:2]), axis=1)) * jnp.mean(nominal.hover_thrust_N)
+    roll = jnp.min(jnp.sum(jnp.abs(nominal.motor_torque_m[:2]), axis=1), axis=0) * jnp.mean(
+        nominal.hover_thrust_N, axis=0
+    )
     factors = jnp.stack(
         [
             4.0 * (world.physics.mass_kg / nominal.mass_kg - 1.0),
-            4.0 * (jnp.mean(world.motor_factor) - 1.0),
-            4.0 * (jnp.mean(world.physics.inertia_kg_m2) / jnp.mean(nominal.inertia_kg_m2) - 1.0),
+            4.0 * (jnp.mean(world.motor_factor, axis=0) - 1.0),
+            4.0 * (_inertia(world.physics) / _inertia(nominal) - 1.0),
             10.0 * world.rotors.rise_s,
             10.0 * world.rotors.fall_s,
             world.latency_s / dt_s,

@@ -104,20 +104,20 @@ def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Di
     torque = _product(physics.motor_torque_m, thrust)
     rotation_matrix = rotation.matrix(body.pose.attitude)
     if physics.motor_axis is None:
-        acceleration = rotation_matrix[:, 2] * (sum(thrust[i] for i in range(thrust.shape[0])) / physics.mass_kg)
+        acceleration = jnp.unstack(rotation_matrix, axis=1)[2] * (sum(jnp.unstack(thrust)) / physics.mass_kg)
     else:
         acceleration = _product(rotation_matrix, _product(physics.motor_axis, thrust) / physics.mass_kg)
     if disturbance is not None:
-        air_speed = _product(rotation_matrix.T, body.twist.velocity_m_s - disturbance.wind_m_s)  # body
+        air_speed = _product(jnp.swapaxes(rotation_matrix, 0, 1), body.twist.velocity_m_s - disturbance.wind_m_s)  # body
         drag = _product(rotation_matrix, disturbance.drag_N_s_m * air_speed)
         acceleration = acceleration + (disturbance.force_N - drag) / physics.mass_kg
         torque = torque + disturbance.torque_N_m
     gravity = jnp.stack([jnp.zeros_like(physics.gravity_m_s2)] * 2 + [physics.gravity_m_s2])
     inertia = physics.inertia_kg_m2
-    if inertia.ndim == 1:
-        angular = (torque - jnp.cross(omega, inertia * omega)) / inertia
+    if inertia.ndim == omega.ndim:
+        angular = (torque - rotation.cross(omega, inertia * omega)) / inertia
     else:
-        angular = _solve(inertia, torque - jnp.cross(omega, _product(inertia, omega)))
+        angular = _solve(inertia, torque - rotation.cross(omega, _product(inertia, omega)))
     return Body(
         pose=Pose(body.twist.velocity_m_s, rotation.derivative(body.pose.attitude, omega)),
         twist=Twist(velocity_m_s=acceleration - gravity, body_rate_rad_s=angular),
@@ -129,14 +129,15 @@ def _product(matrix: chex.Array, vector: chex.Array) -> chex.Array:
 
     Term by term: a CPU takes half as long again for sums over an axis as short as this.
     """
-    return sum((matrix[:, i] * vector[i] for i in range(1, vector.shape[0])), matrix[:, 0] * vector[0])
+    first, *others = zip(jnp.unstack(matrix, axis=1), jnp.unstack(vector), strict=True)
+    return sum((column * x for column, x in others), first[0] * first[1])
 
 
 def _solve(matrix: chex.Array, vector: chex.Array) -> chex.Array:
     """matrix⁻¹·vector of a symmetric [3, 3], by Cramer's rule; [3]."""
     a, b, c = matrix
-    adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)])
-    return _product(adjugate, vector) / jnp.sum(a * adjugate[0])
+    adjugate = jnp.stack([rotation.cross(b, c), rotation.cross(c, a), rotation.cross(a, b)])
+    return _product(adjugate, vector) / jnp.sum(a * adjugate[0], axis=0)
 
 
 def step(physics: Physics, body: Body, thrust: chex.Array, dt_s: float) -> Body:
@@ -149,7 +150,7 @@ def observe(body: Body) -> chex.Array:
     """The observation [18]: rotation matrix body -> world row-major, position [m] and
     velocity [m/s] (world), body rates [rad/s].
     """
-    return jnp.concatenate([rotation.matrix(body.pose.attitude).reshape(9), body.pose.position_m, *body.twist])
+    return jnp.concatenate([*jnp.unstack(rotation.matrix(body.pose.attitude)), body.pose.position_m, *body.twist])
 
 
 def draw(start: Start, key: chex.PRNGKey) -> Body:

@@ -12,7 +12,7 @@ from qrl_envs.task import CircleReward, HoverReward, PendulumReward
 
 def _norm(x: chex.Array) -> chex.Array:
     """Euclidean norm [], with gradient 0 at 0, where that of jnp.linalg.norm is not a number."""
-    square = jnp.sum(x * x)
+    square = jnp.sum(x * x, axis=0)
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
@@ -29,8 +29,8 @@ class Hover(NamedTuple):
 
         q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, the same attitude, cost the same.
         """
-        q = body.pose.attitude
-        q_e = jnp.concatenate([1.0 - jnp.abs(q[:1]), q[1:]])
+        w, *xyz = jnp.unstack(body.pose.attitude)
+        q_e = jnp.stack([1.0 - jnp.abs(w), *xyz])
         p_e = body.pose.position_m
         return self.constant - (
             self.w1_attitude * _norm(q_e) + self.w2_position_1_m * _norm(p_e) + self.w3_action * _norm(action)
@@ -52,9 +52,9 @@ class Circle(NamedTuple):
 
         d is the distance to the circle and chi = x·vy − y·vx − r_des·v_des (paper, Sec. 5.3).
         """
-        x, y, z = body.pose.position_m
-        vx, vy, _ = body.twist.velocity_m_s
-        d = _norm(jnp.stack([_norm(body.pose.position_m[:2]) - self.radius_m, z]))
+        x, y, z = jnp.unstack(body.pose.position_m)
+        vx, vy, _ = jnp.unstack(body.twist.velocity_m_s)
+        d = _norm(jnp.stack([_norm(jnp.stack([x, y])) - self.radius_m, z]))
         chi = x * vy - y * vx - self.radius_m * self.speed_m_s
         return self.constant - (
             self.w4_distance_1_m * d + self.w5_direction_s_m2 * jnp.abs(chi) + self.w6_action * _norm(action)

@@ -1,4 +1,4 @@
-"""Unit quaternions [w, x, y, z], body -> world. For one quaternion; the caller vmaps."""
+"""Unit quaternions [w, x, y, z], body -> world. For one quaternion, or for many that lie along trailing axes."""
 
 import chex
 import jax
@@ -7,8 +7,9 @@ import jax.numpy as jnp
 
 def product(p: chex.Array, q: chex.Array) -> chex.Array:
     """Hamilton product p ⊗ q; [4], [4] -> [4]."""
-    pw, px, py, pz = p[0], p[1], p[2], p[3]
-    qw, qx, qy, qz = q[0], q[1], q[2], q[3]
+    # Taken apart by unstack, here and elsewhere: the gradient of an index is an addition of a padded vector.
+    pw, px, py, pz = jnp.unstack(p)
+    qw, qx, qy, qz = jnp.unstack(q)
     return jnp.stack(
         [
             pw * qw - px * qx - py * qy - pz * qz,
@@ -19,19 +20,28 @@ def product(p: chex.Array, q: chex.Array) -> chex.Array:
     )
 
 
+def cross(a: chex.Array, b: chex.Array) -> chex.Array:
+    """a × b; [3], [3] -> [3]."""
+    ax, ay, az = jnp.unstack(a)
+    bx, by, bz = jnp.unstack(b)
+    return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
 def derivative(q: chex.Array, body_rate: chex.Array) -> chex.Array:
     """dq/dt = ½ q ⊗ [0, ω] for a body rate ω [rad/s] in the body frame; [4], [3] -> [4]."""
-    return 0.5 * product(q, jnp.concatenate([jnp.zeros_like(body_rate[:1]), body_rate]))
+    w, x, y, z = jnp.unstack(q)
+    a, b, c = jnp.unstack(0.5 * body_rate)
+    return jnp.stack([-x * a - y * b - z * c, w * a + y * c - z * b, w * b - x * c + z * a, w * c + x * b - y * a])
 
 
 def normalize(q: chex.Array) -> chex.Array:
     """q/‖q‖; [4] -> [4]."""
-    return q * jax.lax.rsqrt(jnp.sum(jnp.square(q)))
+    return q * jax.lax.rsqrt(jnp.sum(jnp.square(q), axis=0))
 
 
 def matrix(q: chex.Array) -> chex.Array:
     """Rotation matrix body -> world of a unit quaternion; [4] -> [3, 3]. Its columns are the body axes in the world."""
-    w, x, y, z = q[0], q[1], q[2], q[3]
+    w, x, y, z = jnp.unstack(q)
     return jnp.stack(
         [
             jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),

@@ -3,6 +3,7 @@
 from typing import Any
 
 import chex
+import jax
 
 from qrl.algorithm.types import Env, Evaluation, State, Symmetry, TaskEnv
 
@@ -10,7 +11,7 @@ BRAX_EPISODE_STEPS = 1000  # Brax's customary episode length
 
 _ABILITIES = (
     *("params", "policy_observation_size", "episode_steps", "control_period_s", "differentiable"),
-    *("with_params", "restart", "reset_calibration", "symmetry", "evaluation"),
+    *("with_params", "restart", "step_lanes", "reset_calibration", "symmetry", "evaluation"),
 )
 
 
@@ -37,6 +38,9 @@ class _Adapted:
     def restart(self, state: Any, rng: chex.PRNGKey) -> State:
         del state
         return self.unwrapped_env.reset(rng)
+
+    def step_lanes(self, state: Any, action: chex.Array) -> State:
+        return jax.vmap(self.unwrapped_env.step, in_axes=-1, out_axes=-1)(state, action)
 
     def reset_calibration(self, rng: chex.PRNGKey) -> State:
         return self.unwrapped_env.reset(rng)

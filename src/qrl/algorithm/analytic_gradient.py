@@ -5,14 +5,16 @@ differentiable. It needs no stored trajectories and no value function.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 
 from qrl.algorithm import learner
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
-from qrl.algorithm.types import Env, State, info_flag
+from qrl.algorithm.types import Env, State, TaskEnv, info_flag
 from qrl.config import Hyperparameters
 
 Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [..., A]
@@ -20,7 +22,7 @@ Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [.
 
 @jax.custom_vjp
 def _bounded(tree: chex.ArrayTree, limit: chex.Array) -> chex.ArrayTree:
-    """`tree`, with leading axis n; on the way back the norm of each of the n cotangents is at most `limit`."""
+    """`tree`, with last axis n; on the way back the norm of each of the n cotangents is at most `limit`."""
     del limit
     return tree
 
@@ -31,14 +33,11 @@ def _bounded_forward(tree: chex.ArrayTree, limit: chex.Array) -> tuple[chex.Arra
 
 def _bounded_backward(limit: chex.Array, cotangent: chex.ArrayTree) -> tuple[chex.ArrayTree, None]:
     leaves = [x for x in jax.tree.leaves(cotangent) if x.dtype != jax.dtypes.float0]
-    square = sum(jnp.sum(x.reshape(x.shape[0], -1) ** 2, axis=1) for x in leaves)
+    square = jnp.sum(jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in leaves]) ** 2, axis=0)
     factor = jnp.where(jnp.isfinite(square), jnp.minimum(1.0, limit * jax.lax.rsqrt(square + 1e-20)), 0.0)
 
     def scaled(x: chex.Array) -> chex.Array:
-        if x.dtype == jax.dtypes.float0:
-            return x
-        each = factor.reshape(-1, *[1] * (x.ndim - 1))
-        return jnp.where(each > 0.0, x * each, 0.0)
+        return x if x.dtype == jax.dtypes.float0 else jnp.where(factor > 0.0, x * factor, 0.0)
 
     return jax.tree.map(scaled, cotangent), None
 
@@ -57,28 +56,45 @@ def returns(
     of a flight's return with respect to its state after any step is cut to that norm: long flights of a lagged vehicle
     are chaotic, and a few of them would drown all others.
     """
+    env = adapt(env)
 
     def one(key: chex.PRNGKey) -> tuple[State, chex.Array]:
         start, noise = jax.random.split(key)
         return env.reset(start), jax.random.normal(noise, (steps, env.action_size))
 
+    # Flights lie along the last axis: so a CPU takes vectors of them.
+    states, noise = jax.vmap(one, out_axes=-1)(keys)
+    constant = _constant_leaves(env, states, noise[0])
+
+    def changing_of(state: State) -> State:
+        return jax.tree.map(lambda x, same: None if same else x, state, constant)
+
     def step(carry: tuple[State, chex.Array], noise: chex.Array) -> tuple[tuple[State, chex.Array], chex.Array]:
-        state, alive = carry
-        after = jax.vmap(env.step)(state, jnp.clip(mean(state.obs) + sigma * noise, -1.0, 1.0))
+        changing, alive = carry
+        state = jax.tree.map(lambda x, first: first if x is None else x, changing, states, is_leaf=lambda x: x is None)
+        after = env.step_lanes(state, jnp.clip(mean(state.obs.T).T + sigma * noise, -1.0, 1.0))
         charge = jnp.where(info_flag(state, "out_of_bounds"), state.reward, jnp.minimum(state.reward, 0.0))
         reward = jnp.where(alive > 0, after.reward, charge)
-        held = jax.tree.map(
-            lambda new, old: jnp.where(alive.reshape(-1, *[1] * (new.ndim - 1)) > 0, new, old), after, state
-        )
+        changing = jax.tree.map(lambda new, old: jnp.where(alive > 0, new, old), changing_of(after), changing)
         if cotangent_norm is not None:
-            held = held.replace(pipeline_state=_bounded(held.pipeline_state, cotangent_norm))
-        return (held, alive * (1.0 - after.done)), reward
+            changing = changing.replace(pipeline_state=_bounded(changing.pipeline_state, cotangent_norm))
+        return (changing, alive * (1.0 - after.done)), reward
 
-    states, noise = jax.vmap(one)(keys)
     # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.
-    first = states, jnp.ones_like(states.reward)
-    (_, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, jnp.swapaxes(noise, 0, 1))
+    first = changing_of(states), jnp.ones_like(states.reward)
+    (_, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, noise)
     return jnp.sum(rewards, axis=0), alive > 0
+
+
+def _constant_leaves(env: TaskEnv, states: State, action: chex.Array) -> Any:
+    """Of each leaf of a batch of states, whether a step passes it on as it is; a tree of bool.
+
+    What is constant during a flight stays out of the loop over steps, and so does its gradient.
+    """
+    leaves, structure = jax.tree.flatten(states)
+    jaxpr = jax.make_jaxpr(env.step_lanes)(states, action).jaxpr
+    same = [new is old for new, old in zip(jaxpr.outvars, jaxpr.invars[: len(leaves)], strict=True)]
+    return jax.tree.unflatten(structure, same)
 
 
 def decay(step: chex.Array, updates: chex.Array) -> chex.Array:

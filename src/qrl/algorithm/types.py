@@ -82,6 +82,7 @@ class TaskEnv(Env, Protocol):
     def differentiable(self) -> bool: ...  # step and reward, as APG needs
     def with_params(self, params: Any) -> "TaskEnv": ...  # of the same structure; may be tracers
     def restart(self, state: Any, rng: chex.PRNGKey) -> State: ...  # a fresh start that keeps the state's parameters
+    def step_lanes(self, state: Any, action: chex.Array) -> Any: ...  # `step`; lanes lie along the last axis of leaves
     def reset_calibration(self, rng: chex.PRNGKey) -> State: ...  # a start that a deployed policy must cope with
     def symmetry(self, u: chex.Array) -> Symmetry | None: ...  # a random one, drawn with u [2] in [0, 1)
     def evaluation(self) -> Evaluation | None: ...  # None: one episode, nothing measured
