@@ -102,6 +102,10 @@ class TaskEnv(abc.ABC):
     differentiable = True  # step and reward
     policy_observation_size: int | None = None  # a policy sees this many numbers of an observation; None: all
 
+    def policy_view(self, observation: chex.Array) -> chex.Array:
+        """The input of a policy network, of what a policy sees of an observation; [..., F] -> [..., I]."""
+        return observation
+
     def with_params(self, params: Params) -> "TaskEnv":
         """A copy with other parameters of the same structure, which may be tracers."""
         other = copy.copy(self)
@@ -252,7 +256,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
     """Hover or circle with a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
 
     Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, then its
-    memory, as the task has it: previous action [N], integral of the position error [3], on a circle of the height [1];
+    memory, as the task has it: previous action [N], integral of the position error [3], on a circle [2];
     then what only a critic may see (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as
     in `QuadrotorEnv`.
     """
@@ -264,7 +268,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         uncertainty = uncertainty or task.uncertainty or Uncertainty()
         self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
         self._integrator = plant.integrator(task)
-        motors, integrals = len(task.vehicle.motors), len(self._integrator.axes) if self._integrator else 0
+        motors, integrals = len(task.vehicle.motors), self._integrator.size if self._integrator else 0
         self.policy_observation_size = 18 + task.memory.previous_action * motors + integrals
         self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
         latency_s = uncertainty.latency_s[1] if most_latency_s is None else most_latency_s
@@ -278,6 +282,9 @@ class RealQuadrotorEnv(QuadrotorEnv):
 
     def _with_truth(self, state: State) -> State:
         return state.replace(info={**state.info, "true_obs": quadrotor.observe(state.pipeline_state.x.body)})
+
+    def policy_view(self, observation: chex.Array) -> chex.Array:
+        return quadrotor.in_body_frame(observation) if self.task.policy_frame == "body" else observation
 
     def _start(self, params: Any, key: chex.PRNGKey) -> quadrotor.Body:
         return quadrotor.draw(params.start, key)
@@ -313,8 +320,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         if self.task.memory.previous_action:
             parts.append(plain.action)
         if self._integrator:
-            axes = jnp.array(self._integrator.axes)
-            parts.append(world[axes[:, None], axes])
+            parts.append(jnp.eye(2) if self._integrator.circle_m else world)
         parts += [world, body, jnp.eye(plant.PRIVILEGED - 6), plain.action]
         return Symmetry(jax.scipy.linalg.block_diag(*parts), plain.action)
 

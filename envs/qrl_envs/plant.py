@@ -151,19 +151,24 @@ class Flight(NamedTuple):
 
 
 class Integrator(NamedTuple):
-    """`task.Integral`, and which axes of the position are an error: all in hover, the height alone on a circle."""
+    """`task.Integral`, and the radius of the circle, if the task has one."""
 
-    axes: tuple[int, ...]
+    circle_m: float | None
     radius_m: float
     limit_m_s: float
+
+    @property
+    def size(self) -> int:
+        """k, the number of components of the error."""
+        return 2 if self.circle_m else 3
 
 
 def integrator(task: QuadrotorTask) -> Integrator | None:
     """The integrator of a task whose policy observes the integral, else None."""
     if (integral := task.memory.integral) is None:
         return None
-    axes = (2,) if isinstance(task.reward, CircleReward) else (0, 1, 2)
-    return Integrator(axes, integral.radius_m, integral.limit_m_s)
+    circle_m = task.reward.radius_m if isinstance(task.reward, CircleReward) else None
+    return Integrator(circle_m, integral.radius_m, integral.limit_m_s)
 
 
 def delayed_steps(latency_s: float, dt_s: float) -> int:
@@ -185,7 +190,7 @@ def begin(body: Body, world: World, steps_late: int, integrator: Integrator | No
         sensed=sensed,
         previous_action=jnp.zeros(motors),
         integral_m_s=integrated(
-            jnp.zeros(len(integrator.axes) if integrator else 0), sensed.pose.position_m, integrator, dt_s
+            jnp.zeros(integrator.size if integrator else 0), sensed.pose.position_m, integrator, dt_s
         ),
         steps=jnp.int32(0),
     )
@@ -252,8 +257,11 @@ def integrated(total: chex.Array, position_m: chex.Array, integrator: Integrator
     """The integral [k] after a period at `position_m` [3] (`task.Integral`)."""
     if integrator is None:
         return total
-    coordinates = jnp.unstack(position_m)
-    error = jnp.stack([coordinates[axis] for axis in integrator.axes])
+    x, y, z = jnp.unstack(position_m)
+    if integrator.circle_m:
+        error = jnp.stack([(x * x + y * y - integrator.circle_m**2) / (2.0 * integrator.circle_m), z])
+    else:
+        error = jnp.stack([x, y, z])
     near = jnp.maximum(0.0, 1.0 - jnp.sum(error**2, axis=0) / integrator.radius_m**2)
     return jnp.clip(total + dt_s * error * near**2, -integrator.limit_m_s, integrator.limit_m_s)
 

@@ -108,7 +108,9 @@ def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Di
     else:
         acceleration = _product(rotation_matrix, _product(physics.motor_axis, thrust) / physics.mass_kg)
     if disturbance is not None:
-        air_speed = _product(jnp.swapaxes(rotation_matrix, 0, 1), body.twist.velocity_m_s - disturbance.wind_m_s)  # body
+        air_speed = _product(
+            jnp.swapaxes(rotation_matrix, 0, 1), body.twist.velocity_m_s - disturbance.wind_m_s
+        )  # body
         drag = _product(rotation_matrix, disturbance.drag_N_s_m * air_speed)
         acceleration = acceleration + (disturbance.force_N - drag) / physics.mass_kg
         torque = torque + disturbance.torque_N_m
@@ -151,6 +153,23 @@ def observe(body: Body) -> chex.Array:
     velocity [m/s] (world), body rates [rad/s].
     """
     return jnp.concatenate([*jnp.unstack(rotation.matrix(body.pose.attitude)), body.pose.position_m, *body.twist])
+
+
+def in_body_frame(observation: chex.Array) -> chex.Array:
+    """An observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
+    position [3], velocity [3], body rates [3]; then what follows them. [..., 18 + M] -> [..., 12 + M].
+    """
+    numbers = jnp.unstack(observation[..., :18], axis=-1)
+    rows, rates = (numbers[0:3], numbers[3:6], numbers[6:9]), numbers[15:18]
+
+    def turned(vector: tuple[chex.Array, ...]) -> list[chex.Array]:
+        return [
+            sum(row[j] * x for row, x in zip(rows[1:], vector[1:], strict=True)) + rows[0][j] * vector[0]
+            for j in range(3)
+        ]
+
+    body = jnp.stack([*rows[2], *turned(numbers[9:12]), *turned(numbers[12:15]), *rates], axis=-1)
+    return jnp.concatenate([body, observation[..., 18:]], axis=-1)
 
 
 def draw(start: Start, key: chex.PRNGKey) -> Body:

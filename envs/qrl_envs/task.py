@@ -41,8 +41,8 @@ class Bounds(Spec):
 class Integral(Spec):
     """The integral of the position error as an observation; far from the target, where it would wind up, it stands.
 
-    dI/dt = p·max(0, 1 − |p|²/radius_m²)², within ±limit_m_s for each axis. In hover p is the position; on a circle the
-    height alone, which is all that firmware can tell of the error without knowing the circle.
+    dI/dt = e·max(0, 1 − |e|²/radius_m²)², within ±limit_m_s for each component. In hover e is the position; on a circle
+    of radius R, [(x² + y² − R²)/(2R), z]: near the circle, the distance to its radius, and the height.
     """
 
     radius_m: Positive = 0.5
@@ -131,6 +131,8 @@ class QuadrotorTask(Spec):
     vehicle: Vehicle
     uncertainty: Uncertainty | None = None
     memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `vehicle.Later`
+    # The frame of what a policy network is given: the world's, or the body's without the heading. As `vehicle.Later`.
+    policy_frame: Annotated[Literal["world", "body"], Field(exclude_if=lambda x: x == "world")] = "world"
     start: FlightStart
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
     bounds: Bounds
@@ -176,7 +178,8 @@ class QuadrotorTask(Spec):
     @property
     def ideal(self) -> bool:
         """Whether this is the paper's world: thrust at once, no drag, nothing uncertain, no memory."""
-        return self.vehicle.ideal and self.uncertainty is None and self.memory == Memory()
+        plain = self.memory == Memory() and self.policy_frame == "world"
+        return self.vehicle.ideal and self.uncertainty is None and plain
 
     def warnings(self) -> list[str]:
         """What is accepted and may not work, in one line each."""

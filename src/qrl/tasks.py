@@ -201,6 +201,7 @@ def check(env: Env, learner: Config, where: str) -> None:
         raise BadInput(
             f"{where}: key 'observation_scale': expected {size} numbers, one for each observation, found {given}"
         )
+    _check_frame(env, learner, where)
     try:
         adapt(env)
     except ValueError as error:
@@ -220,6 +221,21 @@ def check(env: Env, learner: Config, where: str) -> None:
             raise BadInput(
                 f"{where}: key 'apg_fraction': expected 0, for this environment cannot be differentiated: {error}"
             ) from None
+
+
+def _check_frame(env: Env, learner: Config, where: str) -> None:
+    """Whether what a policy is given in the body frame is scaled alike along all axes."""
+    task = getattr(env, "task", None)
+    if getattr(task, "policy_frame", "world") == "world":
+        return
+    if learner.normalize_observations:
+        raise BadInput(f"{where}: key 'normalize_observations': expected false for a task with policy_frame 'body'")
+    scale = learner.observation_scale or (1.0,) * 18
+    if len({*scale[:9], 1.0}) + len({*scale[9:12]}) + len({*scale[12:15]}) > 3:
+        raise BadInput(
+            f"{where}: key 'observation_scale': expected 1 for the rotation matrix, and the same along x, y and z for"
+            f" position and for velocity, for a task with policy_frame 'body'; found {list(scale[:15])}"
+        )
 
 
 MOST_SEEDS = 10_000  # of one program

@@ -112,9 +112,11 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
     return replace(made, layers=(*rest, (weight, bias - middle)))
 
 
-# Both kinds of memory, and each alone; an odd number of actions; positions of very different sizes and steps, clipped.
+# Both kinds of memory, and each alone; a circle, in the body frame; an odd number of actions; positions of very
+# different sizes and steps, clipped.
 REMEMBERING = {
     "both": (HOVER, Memory(True, Integral((9, 10, 11), radius_m=1.0, limit_m_s=0.4))),
+    "circle": (HOVER, Memory(True, Integral((9, 10, 11), radius_m=0.9, limit_m_s=0.3, circle_m=1.5))),
     "action": (HOVER, Memory(True, None)),
     "integral": (HOVER, Memory(False, Integral((9, 10, 11), radius_m=0.3, limit_m_s=0.05))),
     "one action": (PENDULUM, Memory(True, Integral((2, 0, 1), radius_m=3.0, limit_m_s=1.0))),
@@ -122,11 +124,20 @@ REMEMBERING = {
 }
 
 
+def in_body_frame(base: Policy) -> Policy:
+    """A policy of a vehicle whose network is given its observations in the body frame."""
+    scale = np.repeat([1.0, 0.8, 0.5, 0.3], [9, 3, 3, 3])
+    (weight, bias), *others = base.layers
+    return replace(base, body_frame=True, observation_scale=scale, layers=((weight[6:], bias), *others))
+
+
 @cache
 def remembering(which: str = "both", activation: str = "relu") -> Policy:
     """A lively policy with memory: each of its inputs moves the actions."""
     sizes, memory = REMEMBERING[which]
     base = policy(sizes, activation)
+    if which == "circle":
+        base = in_body_frame(base)
     actions, n = len(base.actions), len(base.calibration)
     rng = np.random.default_rng([7, *sizes])
     columns, offset, gain = [base.calibration], [base.observation_offset], [base.observation_gain]
@@ -135,9 +146,9 @@ def remembering(which: str = "both", activation: str = "relu") -> Policy:
         offset.append(base.offset)
         gain.append(1.0 / base.scale)
     if memory.integral:
-        columns.append(memory.integral.limit_m_s * rng.uniform(-1.0, 1.0, (n, 3)) ** 3)
-        offset.append(np.zeros(3))
-        gain.append(np.full(3, 2.0 / memory.integral.limit_m_s))
+        columns.append(memory.integral.limit_m_s * rng.uniform(-1.0, 1.0, (n, memory.integral.size)) ** 3)
+        offset.append(np.zeros(memory.integral.size))
+        gain.append(np.full(memory.integral.size, 2.0 / memory.integral.limit_m_s))
     (weight, bias), *hidden, (last, last_bias) = base.layers
     more = rng.normal(size=(memory.size(actions), weight.shape[1])) * 0.5 * (2.0 / len(weight)) ** 0.5
     made = replace(
@@ -164,6 +175,11 @@ def outputs(policy: Policy, inputs: np.ndarray) -> np.ndarray:
     """The network's own outputs [n, A], written apart from Policy."""
     x = (inputs.astype(np.float64) - policy.observation_offset) * policy.observation_gain
     x = np.minimum(np.maximum(x, -policy.observation_clip), policy.observation_clip) * policy.observation_scale
+    if policy.body_frame:
+        to_body = [row[:9].reshape(3, 3).T for row in x]
+        x = np.array(
+            [[*row[6:9], *(m @ row[9:12]), *(m @ row[12:15]), *row[15:]] for m, row in zip(to_body, x, strict=True)]
+        )
     for i, (weight, bias) in enumerate(policy.layers):
         x = np.einsum("ni,io->no", x, weight) + bias
         if i < len(policy.layers) - 1:

@@ -10,7 +10,7 @@ from qrl.algorithm.types import Env, Evaluation, State, Symmetry, TaskEnv
 BRAX_EPISODE_STEPS = 1000  # Brax's customary episode length
 
 _ABILITIES = (
-    *("params", "policy_observation_size", "episode_steps", "control_period_s", "differentiable"),
+    *("params", "policy_observation_size", "policy_view", "episode_steps", "control_period_s", "differentiable"),
     *("with_params", "restart", "step_lanes", "reset_calibration", "symmetry", "evaluation"),
 )
 
@@ -30,6 +30,9 @@ class _Adapted:
     policy_observation_size: int | None = None
     episode_steps: int = BRAX_EPISODE_STEPS
     differentiable: bool = False  # not known
+
+    def policy_view(self, observation: chex.Array) -> chex.Array:
+        return observation
 
     def with_params(self, params: Any) -> Any:
         del params

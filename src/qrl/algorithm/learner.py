@@ -33,6 +33,9 @@ class LearnerSpec(NamedTuple):
     action_size: int
     axis: str | None = None  # mesh axis over which a minibatch is sharded; None: one device
     policy_observation_size: int | None = None  # the policy sees this many, the first; None: all
+    policy_view: Callable[[chex.Array], chex.Array] = lambda observation: (
+        observation
+    )  # the policy network's input of it
 
     @property
     def policy(self) -> MLP:
@@ -104,13 +107,13 @@ def preprocess(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, o
 
 
 def _seen(spec: LearnerSpec, observation: chex.Array) -> chex.Array:
-    """What the policy sees of observations [..., F]."""
-    return observation[..., : spec.policy_observation_size]
+    """The policy network's input of preprocessed observations [..., F], or of the part that it sees."""
+    return spec.policy_view(observation[..., : spec.policy_observation_size])
 
 
 def policy_mean(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, observation: chex.Array) -> chex.Array:
     """Mean action of the policy, of observations or of what it sees of them; [..., F] -> [..., A]."""
-    seen = preprocess(spec, hyper, state, _seen(spec, observation))
+    seen = _seen(spec, preprocess(spec, hyper, state, observation[..., : spec.policy_observation_size]))
     return networks.apply(spec.policy, state.params.policy, seen)
 
 

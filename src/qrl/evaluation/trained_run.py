@@ -23,7 +23,7 @@ from qrl.algorithm.types import Env, State
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import calibration_starts
-from qrl.export.policy import ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import BODY_SIZE, WORLD_SIZE, ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
@@ -151,7 +151,9 @@ class TrainedRun:
         memory = memory or self._memory()
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
         layers = deployed.params.policy["params"]
+        body_frame = isinstance(self.task, QuadrotorTask) and self.task.policy_frame == "body"
         size = len(layers["Dense_0"]["kernel"])  # of what the policy sees
+        size += (WORLD_SIZE - BODY_SIZE) * body_frame
         normalize = config.normalize_observations
         observations, actions = self._specs()
         mean = np.asarray(deployed.statistics.mean)[:size] if normalize else np.zeros(size)
@@ -178,6 +180,7 @@ class TrainedRun:
             activation=config.activation,
             calibration=np.zeros((0, size), np.float32),
             memory=memory,
+            body_frame=body_frame,
         )
 
     def tail_steps(self) -> int:
@@ -194,7 +197,9 @@ class TrainedRun:
         return Memory(
             previous_action=self.task.memory.previous_action,
             integral=integral
-            and Integral(tuple(POSITION + axis for axis in integral.axes), integral.radius_m, integral.limit_m_s),
+            and Integral(
+                tuple(POSITION + axis for axis in range(3)), integral.radius_m, integral.limit_m_s, integral.circle_m
+            ),
         )
 
     def _control_period_s(self) -> float:
@@ -245,7 +250,7 @@ def flown_inputs(policy: Policy, flights: Flights) -> NDArray[np.float32]:
         first = policy.initial_memory(len(actions))[:, None, : actions.shape[-1]]
         parts.append(np.concatenate([first, actions[:, :-1]], axis=1))
     if policy.memory and policy.memory.integral:
-        totals = [np.zeros((len(measured), len(policy.memory.integral.position)))]
+        totals = [np.zeros((len(measured), policy.memory.integral.size))]
         for observation in measured.swapaxes(0, 1):
             totals.append(policy.integrated(totals[-1], observation))
         parts.append(np.stack(totals[1:], axis=1))

@@ -59,7 +59,7 @@ def state_bytes(kernel: Kernel) -> int:
     if kernel.memory is None:
         return 1
     action = 0 if kernel.memory.initial_action is None else 2 * len(kernel.memory.initial_action)
-    integral = 4 * len(kernel.memory.integral.position) if kernel.memory.integral else 0
+    integral = 4 * kernel.memory.integral.size if kernel.memory.integral else 0
     return -(-(integral + action) // 4) * 4 if integral else action
 
 
@@ -108,6 +108,7 @@ def _memory(policy: Policy, kernel: Kernel) -> dict[str, Any] | None:
         found["integral"] = {
             "of": [policy.observations[i].name for i in policy.memory.integral.position],
             "unit": "m s",
+            "circle_m": policy.memory.integral.circle_m,
             "radius_m": policy.memory.integral.radius_m,
             "limit_m_s": policy.memory.integral.limit_m_s,
             "lsb": kernel.memory.integral.unit_m_s,
@@ -141,8 +142,11 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "state_bytes": f"{size} byte{'' if size == 1 else 's'}",
         "state_size": str(size),
         "previous_action": str(int(kernel.memory is not None and kernel.memory.initial_action is not None)),
-        "integral": str(len(kernel.memory.integral.position) if kernel.memory and kernel.memory.integral else 0),
+        "integral": str(kernel.memory.integral.size if kernel.memory and kernel.memory.integral else 0),
+        "positions": str(len(kernel.memory.integral.position) if kernel.memory and kernel.memory.integral else 0),
         "inputs": str(kernel.widths[0]),
+        "seen": str(kernel.widths[0] - (len(kernel.memory.shift) if kernel.memory else 0)),
+        "turn": str(int(kernel.turn is not None)),
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(run.task),
         "ports": "\n".join(f" * {_comment_safe(line)}".rstrip() for line in _port_lines(policy, kernel)),
@@ -164,7 +168,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
-        "widest": str(max(map(_padded, kernel.widths))),
+        "widest": str(max(map(_padded, (len(kernel.scale), *kernel.widths)))),
         "tanh": str(int(kernel.activation == "tanh")),
         "tables": _tables(kernel, golden, name.upper()),
     }
@@ -180,9 +184,9 @@ def _state(kernel: Kernel) -> tuple[str, str]:
     fields, words = [], []
     if integral := kernel.memory.integral:
         fields.append(
-            f"    int32_t integral[{len(integral.position)}]; /* of the position, in {integral.unit_m_s:.4g} m s */"
+            f"    int32_t integral[{integral.size}]; /* of the position's error, in {integral.unit_m_s:.4g} m s */"
         )
-        words.append("the integral of the position")
+        words.append("the integral of the position's error")
     if (first := kernel.memory.initial_action) is not None:
         fields.append(f"    int16_t previous_action[{len(first)}]; /* in steps of lsb */")
         words.append("the previous action")
@@ -235,6 +239,9 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         parts += _memory_tables(memory, prefix)
         if memory.integral:
             parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
+    if turn := kernel.turn:
+        shifts = zip(("UP", "POSITION", "VELOCITY"), (turn.up, turn.position, turn.velocity), strict=True)
+        parts.append("\n".join(f"#define {name}_SHIFT {shift}" for name, shift in shifts))
     parts += [_layer_tables(i, layer) for i, layer in enumerate(kernel.layers)]
     rows = (
         f"{{weights_{i}.w, biases_{i}, factors_{i}, {sizes[i]}, {sizes[i + 1]},"
@@ -248,7 +255,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
 
 def _memory_tables(memory: Memory, prefix: str) -> list[str]:
     kept = (f"{{{s}, {low}, {high}}}" for s, low, high in zip(memory.shift, memory.low, memory.high, strict=True))
-    parts = [_array(f"struct kept kept[INPUTS - {prefix}_OBS_SIZE]", kept, 8)]
+    parts = [_array("struct kept kept[INPUTS - SEEN]", kept, 8)]
     if memory.initial_action is not None:
         parts.append(_array(f"int16_t act_first[{prefix}_ACT_SIZE]", memory.initial_action, 12))
     return parts
@@ -257,13 +264,18 @@ def _memory_tables(memory: Memory, prefix: str) -> list[str]:
 def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, goldens: int) -> list[str]:
     """`golden`: its states are at the end of the embedded vectors."""
     columns = integral.inverse_radius, integral.gain, integral.inverse_radius_shift, integral.gain_shift
-    axes = (
-        f"{{{at}, {obs_shift[at]}, {', '.join(map(str, numbers))}}}"
-        for at, *numbers in zip(integral.position, *columns, strict=True)
-    )
-    return [
+    errors = (f"{{{', '.join(map(str, numbers))}}}" for numbers in zip(*columns, strict=True))
+    positions = (f"{{{at}, {obs_shift[at]}}}" for at in integral.position)
+    parts = [
         f"#define INTEGRAL_LIMIT {integral.limit}",
-        _array("struct axis axes[INTEGRAL]", axes, 1),
+        _array("struct position positions[POSITIONS]", positions, 4),
+        _array("struct error errors[INTEGRAL]", errors, 1),
+    ]
+    if circle := integral.circle:
+        diameter = (f"{{{factor}, {shift}}}" for factor, shift in zip(circle.factor, circle.shift, strict=True))
+        parts += ["#define CIRCLE 1", _array("struct factor diameter[2]", diameter, 2)]
+    return [
+        *parts,
         _array("int32_t golden_integral[INTEGRAL]", _integrals(golden, integral)[goldens - 1], 3),
     ]
 
@@ -288,7 +300,7 @@ def _layer_tables(index: int, layer: Dense) -> str:
 
 def _integrals(golden: Vectors, integral: Integral) -> Ints:
     """The integral after each vector, the state's first field; [n, k]."""
-    return np.ascontiguousarray(golden.outputs.state[:, : 4 * len(integral.position)]).view("<i4")
+    return np.ascontiguousarray(golden.outputs.state[:, : 4 * integral.size]).view("<i4")
 
 
 def _golden_rows(golden: Vectors, n: int) -> Iterable[str]:

@@ -22,20 +22,39 @@ class Dense:
 
 
 @dataclass(frozen=True, eq=False)
-class Integral:
-    """I += ⌊p·gate·gain / 2^(16 + gain_shift)⌉ per component, within ±limit, in units of `unit_m_s`.
+class Circle:
+    """The position's error on a circle about z, e = [E, z]: E = ⌊(q_x² + q_y² − 2²⁸) / 2¹⁵⌉ in steps of circle_m/2¹⁴.
 
-    p [k]: position in steps of the observation's lsb. With v = ⌊p·inverse_radius / 2^inverse_radius_shift⌉, which is
-    p/radius in 1/2¹⁵, and w = max(0, 2³⁰ − |v|²) / 2¹⁵, gate = w² / 2¹⁵, both rounded down. ⌊⌉: half is rounded up.
+    q_i = ⌊p_i·factor_i / 2^shift_i⌉ within ±32767: x and y, in steps of the observation's lsb, over the circle's
+    diameter in 1/2¹⁵.
     """
 
-    position: tuple[int, int, int]  # indices into the observation
+    factor: Ints  # [2] in [2¹⁴, 2¹⁵)
+    shift: Ints  # [2] in [1, 30]
+
+
+@dataclass(frozen=True, eq=False)
+class Integral:
+    """I += ⌊e·gate·gain / 2^(16 + gain_shift)⌉ per component, within ±limit, in units of `unit_m_s`.
+
+    e [k]: the error in steps: of the observation's lsb, or of `Circle`. With v = ⌊e·inverse_radius /
+    2^inverse_radius_shift⌉, which is e/radius in 1/2¹⁵, and w = max(0, 2³⁰ − |v|²) / 2¹⁵, gate = w² / 2¹⁵, both rounded
+    down. ⌊⌉: half is rounded up.
+    """
+
+    position: tuple[int, ...]  # indices into the observation
     inverse_radius: Ints  # [k] in [2¹⁴, 2¹⁵)
     inverse_radius_shift: Ints  # [k] in [1, 30]
     gain: Ints  # [k] in [0, 2¹⁵)
     gain_shift: Ints  # [k] in [1, 30]
     limit: int  # below 2³⁰
     unit_m_s: float
+    circle: Circle | None = None
+
+    @property
+    def size(self) -> int:
+        """k, the number of components."""
+        return len(self.gain)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +69,18 @@ class Memory:
     shift: Ints  # [M] in [0, 30]
     low: Ints  # [M]
     high: Ints  # [M]
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """The first inputs [12] of a network in the body frame, of a vehicle's 18 measurements x: ⌊x_i / 2^up⌉ of the third
+    row of the rotation matrix; ⌊Σ_i ⌊r_ij·p_i / 2⌋ / 2^position⌉ of the position, likewise of the velocity, each within
+    ±32767; the body rates.
+    """
+
+    up: int  # in [0, 15]
+    position: int  # in [15, 29]
+    velocity: int  # in [15, 29]
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +102,7 @@ class Kernel:
     act_safe: NDArray[np.float32]  # [A] in SI units
     obs_shift: Ints  # [F] in [0, 15]; 0 but for a position that is integrated
     memory: Memory | None = None
+    turn: Turn | None = None  # None: the network is given the observation as it is
 
     @property
     def lsb(self) -> NDArray[np.float64]:
@@ -84,13 +116,17 @@ class Kernel:
             return np.zeros(0)
         parts = [] if self.memory.initial_action is None else [self.act_lsb.astype(np.float64)]
         if self.memory.integral:
-            parts.append(np.full(len(self.memory.integral.position), self.memory.integral.unit_m_s))
+            parts.append(np.full(self.memory.integral.size, self.memory.integral.unit_m_s))
         return np.concatenate(parts) * 2.0**self.memory.shift
 
     @property
     def input_limits(self) -> tuple[Ints, Ints]:
         """Smallest and largest of each of the network's inputs; [F + M]."""
         low, high = (shifted(limit, self.obs_shift) for limit in (self.obs_min, self.obs_max))
+        if self.turn:
+            full = np.full(6, INT16)
+            low = np.concatenate([shifted(low[6:9], self.turn.up), -full, low[15:]])
+            high = np.concatenate([shifted(high[6:9], self.turn.up), full, high[15:]])
         if self.memory is None:
             return low, high
         return np.concatenate([low, self.memory.low]), np.concatenate([high, self.memory.high])
@@ -128,6 +164,11 @@ def _check_fields(kernel: Kernel) -> None:
         ("an input's shift", kernel.obs_shift, 0, 15),
         ("an action's range", np.concatenate([kernel.act_min, kernel.act_max]), -INT16, INT16),
     ]
+    if turn := kernel.turn:
+        ranges += [
+            ("an input's shift", np.array(turn.up), 0, 15),
+            ("an input's shift", np.array([turn.position, turn.velocity]), 15, 29),
+        ]
     if memory := kernel.memory:
         ranges += [
             ("an input's shift", memory.shift, 0, 30),
@@ -143,6 +184,11 @@ def _check_fields(kernel: Kernel) -> None:
                 ("the integral's gain", integral.gain_shift, 1, 30),
                 ("the integral's limit", np.array(integral.limit), 1, 2**30 - 1),
             ]
+            if circle := integral.circle:
+                ranges += [
+                    ("the circle's radius", circle.factor, 2**14, INT16),
+                    ("the circle's radius", circle.shift, 1, 30),
+                ]
     for layer in kernel.layers:
         ranges += [
             ("a weight", layer.weight, -127, 127),
@@ -210,33 +256,52 @@ def initial_state(kernel: Kernel, n: int) -> Ints:
     if kernel.memory is None:
         return np.zeros((n, 0), np.int64)
     first, integral = kernel.memory.initial_action, kernel.memory.integral
-    axes = len(integral.position) if integral else 0
+    axes = integral.size if integral else 0
     parts = [np.zeros(0, np.int64) if first is None else first, np.zeros(axes, np.int64)]
     return np.tile(np.concatenate(parts), (n, 1))
 
 
 def integrated(integral: Integral, total: Ints, position: Ints) -> Ints:
-    """The next integral [n, k] of positions [n, k] in steps."""
-    v = shifted(position * integral.inverse_radius, integral.inverse_radius_shift)
+    """The next integral [n, k] for positions [n, 3] in steps."""
+    error = position
+    if circle := integral.circle:
+        q = np.clip(shifted(position[:, :2] * circle.factor, circle.shift), -INT16, INT16)
+        along = shifted((q * q).sum(axis=-1) - 2**28, 15)
+        error = np.stack([along, position[:, 2]], axis=-1)
+    v = shifted(error * integral.inverse_radius, integral.inverse_radius_shift)
     w = np.maximum(2**30 - np.minimum(v * v, 2**30).sum(axis=-1, keepdims=True), 0) >> 15
     gate = w * w >> 15
-    more = shifted(position * gate * integral.gain >> 16, integral.gain_shift)
+    more = shifted(error * gate * integral.gain >> 16, integral.gain_shift)
     return np.clip(total + more, -integral.limit, integral.limit)
 
 
+def measured(kernel: Kernel, x: Ints) -> Ints:
+    """The network's first inputs, for saturated observations x [n, F]."""
+    turn = kernel.turn
+    if turn is None:
+        return shifted(x, kernel.obs_shift)
+    rotation = x[:, :9].reshape(-1, 3, 3)
+
+    def turned(vector: Ints, shift: int) -> Ints:
+        return np.clip(shifted((rotation * vector[:, :, None] >> 1).sum(axis=1), shift), -INT16, INT16)
+
+    position, velocity = turned(x[:, 9:12], turn.position), turned(x[:, 12:15], turn.velocity)
+    return np.concatenate([shifted(x[:, 6:9], turn.up), position, velocity, x[:, 15:]], axis=-1)
+
+
 def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
-    """The network's inputs [n, F + M] for the state [n, S] and saturated observations x [n, F]."""
-    measured = shifted(x, kernel.obs_shift)
+    """The network's inputs for the state [n, S] and saturated observations x [n, F]."""
+    first = measured(kernel, x)
     if kernel.memory is None:
-        return measured
+        return first
     kept = np.clip(shifted(state, kernel.memory.shift), kernel.memory.low, kernel.memory.high)
-    return np.concatenate([measured, kept], axis=-1)
+    return np.concatenate([first, kept], axis=-1)
 
 
 def _act(kernel: Kernel, state: Ints, x: Ints) -> tuple[Ints, Ints]:
     """Next state and action [n, A] in steps of act_lsb, for saturated observations x [n, F]."""
     if kernel.memory and (integral := kernel.memory.integral):
-        axes = len(integral.position)
+        axes = integral.size
         total = integrated(integral, state[:, -axes:], x[:, list(integral.position)])
         state = np.concatenate([state[:, :-axes], total], axis=-1)
     action = network(kernel, inputs(kernel, state, x))

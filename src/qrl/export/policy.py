@@ -50,15 +50,30 @@ class Provenance:
 
 @dataclass(frozen=True)
 class Integral:
-    """The integral of the measured position p, gated: far away it stands still and cannot wind up.
+    """The integral of the error e of the measured position p, gated: far away it stands still and cannot wind up.
 
-    I_k = clip(I_{k−1} + control period·g(p_k), ±limit_m_s) per component, I = 0 after a reset;
-    g(p) = p·max(0, 1 − |p|²/radius²)².
+    I_k = clip(I_{k−1} + control period·g(e_k), ±limit_m_s) per component, I = 0 after a reset;
+    g(e) = e·max(0, 1 − |e|²/radius²)². To hover, e = p. On a circle about z, e = [(x² + y² − circle²)/(2·circle), z]:
+    near the circle its first component is the distance to the circle's radius.
     """
 
-    position: tuple[int, ...]  # indices into the observation: of p, or of the coordinates that are an error
+    position: tuple[int, ...]  # indices of p in the observation: on a circle of x, y, z
     radius_m: float
     limit_m_s: float
+    circle_m: float | None = None  # radius of the circle; None: hover
+
+    @property
+    def size(self) -> int:
+        """k, the number of components."""
+        return len(self.position) if self.circle_m is None else 2
+
+    def error(self, position: NDArray[np.floating]) -> NDArray[np.float64]:
+        """e [n, k] of positions p [n, 3]."""
+        p = np.asarray(position, np.float64)
+        if self.circle_m is None:
+            return p
+        along = ((p[:, :2] ** 2).sum(axis=-1) - self.circle_m**2) / (2.0 * self.circle_m)
+        return np.stack([along, p[:, 2]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -73,7 +88,20 @@ class Memory:
 
     def size(self, actions: int) -> int:
         """Number of these inputs."""
-        return actions * self.previous_action + (len(self.integral.position) if self.integral else 0)
+        return actions * self.previous_action + (self.integral.size if self.integral else 0)
+
+
+WORLD_SIZE, BODY_SIZE = 18, 12  # numbers of a vehicle's measurements, and of these in the body frame
+
+
+def in_body_frame(observation: NDArray[np.floating]) -> NDArray[np.float64]:
+    """The observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
+    position [3], velocity [3], body rates [3]; then what follows them. [n, 18 + M] -> [n, 12 + M].
+    """
+    o = np.asarray(observation, np.float64)
+    rotation = o[:, :9].reshape(-1, 3, 3)
+    turned = [np.einsum("nij,ni->nj", rotation, o[:, at : at + 3]) for at in (9, 12)]
+    return np.concatenate([o[:, 6:9], *turned, o[:, 15:]], axis=-1)
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outputs], bias [outputs]
@@ -81,9 +109,10 @@ Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outpu
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """Deterministic policy in SI units: inputs [..., I] -> action [..., A].
+    """Deterministic policy in SI units: inputs [n, I] -> action [n, A].
 
-    The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds [M]; I = F + M.
+    The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds [M]; I = F + M. With
+    `body_frame` the network is given `in_body_frame` of them.
     """
 
     provenance: Provenance
@@ -98,15 +127,23 @@ class Policy:
     activation: str  # of all layers but the last: "relu" or "tanh"
     calibration: NDArray[np.float32]  # [n, I] inputs of the policy's own flights
     memory: Memory | None = None
+    body_frame: bool = False
 
     def __call__(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Action in SI units; [..., I] -> [..., A]. Of a policy without memory the inputs are the observation."""
+        """Action in SI units; [n, I] -> [n, A]. Of a policy without memory the inputs are the observation."""
         x = (inputs - self.observation_offset) * self.observation_gain
         x = np.clip(x, -self.observation_clip, self.observation_clip) * self.observation_scale
+        x = in_body_frame(x) if self.body_frame else x
         for weight, bias in self.layers[:-1]:
             x = ACTIVATIONS[self.activation](x @ weight + bias)
         weight, bias = self.layers[-1]
         return self.to_si(x @ weight + bias)
+
+    @property
+    def input_gain(self) -> NDArray[np.float64]:
+        """The network's inputs over those in SI units; one for each row of its first layer."""
+        gain = self.observation_gain * self.observation_scale
+        return np.concatenate([gain[6:WORLD_SIZE], gain[WORLD_SIZE:]]) if self.body_frame else gain
 
     @property
     def memory_size(self) -> int:
@@ -131,7 +168,7 @@ class Policy:
         finite = np.isfinite(observation).all(axis=-1, keepdims=True)
         observation, before = np.where(finite, observation, 0.0), memory
         if self.memory and self.memory.integral:
-            axes = len(self.memory.integral.position)
+            axes = self.memory.integral.size
             memory = np.concatenate([memory[:, :-axes], self.integrated(memory[:, -axes:], observation)], axis=-1)
         action = self(np.concatenate([observation, memory], axis=-1))
         if self.memory and self.memory.previous_action:
@@ -144,9 +181,9 @@ class Policy:
         assert self.memory
         assert self.memory.integral
         integral = self.memory.integral
-        p = observation[:, list(integral.position)]
-        gate = np.maximum(0.0, 1.0 - (p**2).sum(axis=-1, keepdims=True) / integral.radius_m**2) ** 2
-        return np.clip(total + self.control_period_s * gate * p, -integral.limit_m_s, integral.limit_m_s)
+        e = integral.error(observation[:, list(integral.position)])
+        gate = np.maximum(0.0, 1.0 - (e**2).sum(axis=-1, keepdims=True) / integral.radius_m**2) ** 2
+        return np.clip(total + self.control_period_s * gate * e, -integral.limit_m_s, integral.limit_m_s)
 
     def to_si(self, a: NDArray[np.floating]) -> NDArray[np.float64]:
         """Action [..., A] in SI units of the network's output a."""

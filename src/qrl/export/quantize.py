@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
-from qrl.export.policy import ACTIVATIONS, Layer, Policy
+from qrl.export.policy import ACTIVATIONS, BODY_SIZE, WORLD_SIZE, Layer, Policy, in_body_frame
 
 Floats = NDArray[np.float64]
 
@@ -65,27 +65,34 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     layers = si_layers(policy)
     clip = policy.observation_clip / policy.observation_gain
     floor, ceiling = policy.observation_offset - clip, policy.observation_offset + clip
-    x_float = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
+    inputs = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
+    x_float = in_body_frame(inputs) if policy.body_frame else inputs
     measured = len(policy.observations)
-    largest = np.abs(x_float[:, :measured]).max(axis=0)
     low, high = policy.limits
     act_lsb = (np.maximum(np.abs(low), np.abs(high)) / INT16).astype(np.float32)
     act_min, act_max = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
-    ranges = np.concatenate(
-        [RANGE_MARGIN * np.where(largest > 0.0, largest, MIN_INPUT), _memory_lsb(policy, act_lsb) * INT16]
-    )
-    wanted = _steps(ranges, layers[0][0], MIN_LEVELS)
-    # What is integrated or remembered has the finest step; a coarser one of the network's input is a shift.
-    shift = np.floor(np.log2(wanted / (ranges / INT16)) + 1e-9).astype(np.int64)
-    integral = policy.memory and policy.memory.integral
-    shifts = np.isin(np.arange(len(ranges)), integral.position if integral else ()) | (
-        np.arange(len(ranges)) >= measured
-    )
-    shift = np.where(shifts, shift, 0)
-    scale, exponent = _as_scale(np.where(shifts, ranges / INT16, wanted)[:measured])
+    remembered = _memory_lsb(policy, act_lsb) * INT16
+    ranges = _ranges(inputs[:, :measured], policy.body_frame)
+    seen = _ranges(x_float[:, : x_float.shape[1] - len(remembered)], same_axes=False) if policy.body_frame else ranges
+    wanted = _steps(np.concatenate([seen, remembered]), layers[0][0], MIN_LEVELS)
+    # What is integrated, remembered or turned has the finest step; a coarser one of the network's input is a shift.
+    shift = np.floor(np.log2(wanted / (np.concatenate([seen, remembered]) / INT16)) + 1e-9).astype(np.int64)
+    remembered_shift, seen_shift = shift[len(seen) :], shift[: len(seen)]
+    finest = ranges / INT16
+    if policy.body_frame:
+        steps = np.concatenate([finest[:15], wanted[9:12]])
+        obs_shift = np.zeros(measured, np.int64)
+    else:
+        integral = policy.memory and policy.memory.integral
+        integrated = np.isin(np.arange(measured), integral.position if integral else ())
+        steps, obs_shift = np.where(integrated, finest, wanted[:measured]), np.where(integrated, seen_shift, 0)
+    scale, exponent = _as_scale(steps)
     lsb = 2.0 ** (exponent - 142) / scale
-    most = np.minimum(np.floor(ranges[:measured] / lsb), INT16)
-    step = np.concatenate([lsb, ranges[measured:] / INT16]) * 2.0**shift
+    most = np.minimum(np.floor(ranges / lsb), INT16)
+    first_step, turn = lsb * 2.0**obs_shift, None
+    if policy.body_frame:
+        turn, first_step = _turn(lsb, wanted)
+    step = np.concatenate([first_step, remembered / INT16 * 2.0**remembered_shift])
     kernel = Kernel(
         scale=scale,
         exponent=exponent,
@@ -97,10 +104,11 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
         act_min=act_min,
         act_max=act_max,
         act_safe=np.array([action.safe for action in policy.actions], np.float32),
-        obs_shift=shift[:measured],
+        obs_shift=obs_shift,
+        turn=turn,
     )
     if policy.memory:
-        kernel = replace(kernel, memory=_memory(policy, kernel, shift[measured:], floor[measured:], ceiling[measured:]))
+        kernel = replace(kernel, memory=_memory(policy, kernel, remembered_shift, floor[measured:], ceiling[measured:]))
 
     subset = slice(None, None, max(1, len(x_float) // FIT_SAMPLES))
     activation_ranges = _activation_ranges(layers, policy.activation, x_float)
@@ -129,11 +137,31 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     return kernel
 
 
+def _ranges(x: Floats, same_axes: bool) -> Floats:
+    """Range of each observation [n, F], or, with `same_axes`, of a vehicle's rotation, position and velocity each."""
+    largest = np.abs(x).max(axis=0)
+    if same_axes:
+        for part in (slice(0, 9), slice(9, 12), slice(12, 15)):
+            largest[part] = largest[part].max()
+    return RANGE_MARGIN * np.where(largest > 0.0, largest, MIN_INPUT)
+
+
+def _turn(lsb: Floats, wanted: Floats) -> tuple[integers.Turn, Floats]:
+    """The shifts into the body frame, and the steps [12] of the network's inputs, at most those wanted where the
+    products allow it.
+    """
+    finest = np.array([lsb[6], 2.0 * lsb[0] * lsb[9], 2.0 * lsb[0] * lsb[12]])
+    groups = np.array([wanted[at : at + 3].min() for at in (0, 3, 6)])
+    up, position, velocity = (int(x) for x in np.clip(np.floor(np.log2(groups / finest)), [0, 15, 15], [15, 29, 29]))
+    steps = finest * 2.0 ** np.array([up, position, velocity])
+    return integers.Turn(up, position, velocity), np.concatenate([np.repeat(steps, 3), lsb[15:]])
+
+
 def respond(kernel: Kernel, x: NDArray[np.floating]) -> NDArray[np.float32]:
     """Actions [n, A] of the kernel for the network's inputs [n, I] in SI units."""
     measured = len(kernel.scale)
     unclipped, _ = integers.quantized(kernel, x[:, :measured].astype(np.float32))
-    q = integers.shifted(np.clip(unclipped, kernel.obs_min, kernel.obs_max), kernel.obs_shift)
+    q = integers.measured(kernel, np.clip(unclipped, kernel.obs_min, kernel.obs_max))
     if kernel.memory:
         kept = np.round(x[:, measured:] / kernel.memory_steps)
         q = np.concatenate([q, np.clip(kept, kernel.memory.low, kernel.memory.high).astype(np.int64)], axis=-1)
@@ -146,7 +174,7 @@ def _memory_lsb(policy: Policy, act_lsb: NDArray[np.float32]) -> Floats:
     if memory is None:
         return np.zeros(0)
     action = act_lsb.astype(np.float64) if memory.previous_action else np.zeros(0)
-    integral = np.full(len(memory.integral.position), memory.integral.limit_m_s / INT16) if memory.integral else []
+    integral = np.full(memory.integral.size, memory.integral.limit_m_s / INT16) if memory.integral else []
     return np.concatenate([action, integral])
 
 
@@ -173,10 +201,13 @@ def _integral(policy: Policy, lsb: Floats) -> tuple[integers.Integral, int]:
     """The integral in integers, and by how many bits its unit is finer than limit / 32767."""
     assert policy.memory
     assert policy.memory.integral
-    position, radius, limit = astuple(policy.memory.integral)
+    position, radius, limit, circle_m = astuple(policy.memory.integral)
     if not (0.0 < radius < np.inf and 0.0 < limit < np.inf):
         raise UnsupportedNetwork(f"an integral within {radius:g} m and {limit:g} m s: expected finite limits above 0")
-    steps = lsb[list(position)]
+    steps, circle = lsb[list(position)], None
+    if circle_m is not None:
+        circle = integers.Circle(*_as_factor(steps[:2] / (2.0 * circle_m) * 2.0**15))
+        steps = np.array([circle_m / 2.0**14, steps[2]])
     increment = policy.control_period_s * steps / (limit / INT16)  # at one step of the position, ungated
     bits = int(np.clip(np.ceil(13.0 - np.log2(increment.max())) - 1.0, 0, INTEGRAL_BITS))
     if increment.max() >= 2.0**13 or increment.min() * 2.0**bits < 1.0:
@@ -195,6 +226,7 @@ def _integral(policy: Policy, lsb: Floats) -> tuple[integers.Integral, int]:
             gain_shift=gain_shift,
             limit=INT16 << bits,
             unit_m_s=unit,
+            circle=circle,
         ),
         bits,
     )
@@ -215,6 +247,10 @@ def _check(policy: Policy) -> None:
     if policy.memory and not policy.memory_size:
         raise UnsupportedNetwork("a memory that holds nothing")
     expected = len(policy.observations) + policy.memory_size
+    if policy.body_frame:
+        expected -= WORLD_SIZE - BODY_SIZE
+        if len(policy.observations) != WORLD_SIZE or np.any(policy.observation_offset[:WORLD_SIZE]):
+            raise UnsupportedNetwork("the body frame: expected a vehicle's 18 observations, not standardized")
     if len(policy.layers[0][0]) != expected:
         raise UnsupportedNetwork(f"layer 0: expected {expected} inputs, found {len(policy.layers[0][0])}")
     if not np.isfinite(policy.calibration).all() or not len(policy.calibration):
@@ -225,8 +261,9 @@ def si_layers(policy: Policy) -> list[Layer]:
     """Layers with observations and actions in SI units: normalization, offset and action scale folded in."""
     layers = [(weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in policy.layers]
     weight, bias = layers[0]
-    weight = weight * (policy.observation_gain * policy.observation_scale)[:, None]
-    layers[0] = weight, bias - policy.observation_offset @ weight
+    weight = weight * policy.input_gain[:, None]
+    offset = policy.observation_offset[WORLD_SIZE - BODY_SIZE if policy.body_frame else 0 :]
+    layers[0] = weight, bias - offset @ weight
     weight, bias = layers[-1]
     layers[-1] = weight * policy.scale, bias * policy.scale + policy.offset
     return layers

@@ -103,6 +103,9 @@ def draw_sequences(policy: Policy, kernel: Kernel, n: int, length: int, seed: in
         axes = len(integral.position)
         inside = rng.uniform(-0.6, 0.6, (n, knots, axes)) * integral.radius_m
         inside[-1] = np.array([0.25, -0.25, 0.0])[:axes] * integral.radius_m
+        if integral.circle_m is not None:
+            inside[-1] = np.array([0.25, 0.0, -0.25]) * integral.radius_m
+            inside[:, :, 0] += integral.circle_m
         rows[:, :, list(integral.position)] = inside
     times = np.arange(length) * (knots - 1) / max(length - 1, 1)
     at = np.minimum(times.astype(int), knots - 2)
@@ -125,7 +128,7 @@ def golden(policy: Policy, kernel: Kernel, n: int = 256) -> Vectors:
         at_limit = np.isin(np.round(act[: n // 2] / kernel.act_lsb), [kernel.act_min, kernel.act_max]).sum(axis=1)
         moves = np.zeros(n // 2)
         if policy.memory and (integral := policy.memory.integral):
-            distance = np.linalg.norm(obs[: n // 2, list(integral.position)].astype(np.float64), axis=1)
+            distance = np.linalg.norm(integral.error(obs[: n // 2, list(integral.position)]), axis=1)
             moves = (distance < 0.8 * integral.radius_m) & (distance > 0.0)
         order = np.lexsort((at_limit, ~moves.astype(bool)))
         obs[: n // 2], status[: n // 2] = obs[order], status[order]

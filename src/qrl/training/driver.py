@@ -124,7 +124,9 @@ def run_chunks(
         if done == report_at or handing_over.any():
             flights: Flights = programs.gather(programs.fly(states.learner, inputs, starts))
             flies = flights.complete.mean(axis=1) >= HANDOVER_SHARE
-            longer = np.where(handing_over & ~flies, config.extended_learning(done), handover)
+            # A bounded gradient learns from flights that go wrong, too.
+            waits = handing_over & ~flies & (config.apg_cotangent_norm is None)
+            longer = np.where(waits, config.extended_learning(done), handover)
             extended = {int(i): longer[i] * config.steps_per_unroll for i in np.flatnonzero(longer > handover)}
             if extended:
                 states = _with_learning_unrolls(states, config, longer)

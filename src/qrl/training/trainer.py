@@ -44,6 +44,7 @@ class Setup(NamedTuple):
             self.env.action_size,
             axis,
             self.env.policy_observation_size,
+            self.env.policy_view,
         )
 
     @property

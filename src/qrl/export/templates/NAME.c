@@ -62,9 +62,12 @@ typedef uint16_t factors;
 
 #define TANH @tanh@ /* else ReLU */
 #define PREVIOUS_ACTION @previous_action@ /* inputs of the network after the observation: the previous action, */
-#define INTEGRAL @integral@        /* then the integral of so many coordinates of the position */
+#define INTEGRAL @integral@        /* then the integral of so many components of the error, */
+#define POSITIONS @positions@       /* which follows from so many coordinates of the position */
 #define MEMORY (PREVIOUS_ACTION || INTEGRAL)
 #define INPUTS @inputs@
+#define SEEN @seen@ /* inputs of the network that follow from the observation */
+#define TURN @turn@ /* whether they are in the body frame */
 
 union activations {
     activation one[@widest@];
@@ -104,9 +107,17 @@ struct kept {
 #endif
 
 #if INTEGRAL
-struct axis {
-    uint8_t input; /* of the position: where it stands in obs, */
+struct position {
+    uint8_t input; /* where it stands in obs, */
     uint8_t shift; /* and its input is the position / 2^shift */
+};
+
+struct factor { /* factor / 2^shift */
+    uint16_t factor;
+    uint8_t shift;
+};
+
+struct error {
     uint16_t inverse_radius;
     uint16_t gain;
     uint8_t inverse_radius_shift, gain_shift;
@@ -335,7 +346,7 @@ static int put(union activations *x, int i, int32_t q) {
     return within != q;
 }
 
-#if MEMORY
+#if MEMORY || TURN
 
 static inline int32_t limited(int32_t x, int32_t least, int32_t most) {
     return x < least ? least : x > most ? most : x;
@@ -350,20 +361,66 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 #if INTEGRAL
 
-/* integral += period * p * max(0, 1 - |p|^2 / radius^2)^2, within its limits, p the position among the inputs. */
+#ifdef CIRCLE
+/* A coordinate over the diameter of the circle, squared, in 1 / 2^30. */
+static int32_t squared(int32_t p, const struct factor *d) {
+    const int32_t q = limited(shifted(p * d->factor, d->shift), -32767, 32767);
+    return q * q;
+}
+#endif
+
+/* integral += period * e * max(0, 1 - |e|^2 / radius^2)^2, within its limits. The error e is the position among the
+   inputs; on a circle of radius c it is (x^2 + y^2 - c^2) / (2 c) and z. */
 static void integrate(int32_t integral[INTEGRAL], union activations *x) {
-    int32_t p[INTEGRAL], inside = (int32_t)1 << 30; /* 1 - |p|^2 / radius^2, in 1 / 2^30 */
+    int32_t e[POSITIONS], inside = (int32_t)1 << 30; /* 1 - |e|^2 / radius^2, in 1 / 2^30 */
+    for (int i = 0; i < POSITIONS; ++i) {
+        e[i] = (int32_t)x->one[positions[i].input] - OFFSET;
+        x->one[positions[i].input] = (activation)(shifted(e[i], positions[i].shift) + OFFSET);
+    }
+#ifdef CIRCLE
+    e[0] = shifted(squared(e[0], diameter) - ((int32_t)1 << 28) + squared(e[1], diameter + 1), 15);
+    e[1] = e[2];
+#endif
     for (int i = 0; i < INTEGRAL; ++i) {
-        p[i] = (int32_t)x->one[axes[i].input] - OFFSET;
-        x->one[axes[i].input] = (activation)(shifted(p[i], axes[i].shift) + OFFSET);
-        const int32_t v = shifted(p[i] * axes[i].inverse_radius, axes[i].inverse_radius_shift);
+        const int32_t v = shifted(e[i] * errors[i].inverse_radius, errors[i].inverse_radius_shift);
         inside -= v >= 32768 || v <= -32768 ? (int32_t)1 << 30 : v * v;
     }
     inside = inside > 0 ? inside >> 15 : 0;
     const int32_t gate = inside * inside >> 15; /* 2^15: open */
     for (int i = 0; i < INTEGRAL; ++i) {
-        const int32_t more = shifted(scaled(p[i] * gate, axes[i].gain), axes[i].gain_shift);
+        const int32_t more = shifted(scaled(e[i] * gate, errors[i].gain), errors[i].gain_shift);
         integral[i] = limited(integral[i] + more, -INTEGRAL_LIMIT, INTEGRAL_LIMIT);
+    }
+}
+
+#endif
+
+#if TURN
+
+/* A vector of the world in the body frame. */
+static void turned(activation y[3], const int32_t r[9], const activation v[3], int shift) {
+    for (int j = 0; j < 3; ++j) {
+        int32_t sum = 0;
+        for (int i = 0; i < 3; ++i) {
+            sum += (r[3 * i + j] * ((int32_t)v[i] - OFFSET)) >> 1;
+        }
+        y[j] = (activation)(limited(shifted(sum, shift), -32767, 32767) + OFFSET);
+    }
+}
+
+/* The observation, rotation matrix, position, velocity and body rates, as it is in the body frame, without heading. */
+static void turn(union activations *x) {
+    int32_t r[9];
+    for (int i = 0; i < 9; ++i) {
+        r[i] = (int32_t)x->one[i] - OFFSET;
+    }
+    for (int i = 0; i < 3; ++i) {
+        x->one[i] = (activation)(shifted(r[6 + i], UP_SHIFT) + OFFSET);
+    }
+    turned(x->one + 3, r, x->one + 9, POSITION_SHIFT);
+    turned(x->one + 6, r, x->one + 12, VELOCITY_SHIFT);
+    for (int i = 9; i < 12; ++i) {
+        x->one[i] = x->one[i + 6];
     }
 }
 
@@ -371,13 +428,16 @@ static void integrate(int32_t integral[INTEGRAL], union activations *x) {
 
 /* The inputs after the observation, which is complete: those of the state, and zeros up to a multiple of 4. */
 static void complete(union activations *x, @name@_state *state) {
-    int i = @NAME@_OBS_SIZE;
+    int i = SEEN;
 #if INTEGRAL
     integrate(state->integral, x);
 #endif
+#if TURN
+    turn(x);
+#endif
 #if MEMORY
     for (const struct kept *k = kept; i < INPUTS; ++i, ++k) {
-        const int at = i - @NAME@_OBS_SIZE;
+        const int at = i - SEEN;
 #if PREVIOUS_ACTION && INTEGRAL
         const int32_t value = at < @NAME@_ACT_SIZE ? state->previous_action[at] : state->integral[at - @NAME@_ACT_SIZE];
 #elif PREVIOUS_ACTION
