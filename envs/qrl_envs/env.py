@@ -256,7 +256,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
     """Hover or circle with a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
 
     Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, then its
-    memory, as the task has it: previous action [N], integral of the position error [3], on a circle [2];
+    memory, as the task has it: previous action [N], integral of the position error [3], on a circle [4];
     then what only a critic may see (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as
     in `QuadrotorEnv`.
     """
@@ -284,7 +284,10 @@ class RealQuadrotorEnv(QuadrotorEnv):
         return state.replace(info={**state.info, "true_obs": quadrotor.observe(state.pipeline_state.x.body)})
 
     def policy_view(self, observation: chex.Array) -> chex.Array:
-        return quadrotor.in_body_frame(observation) if self.task.policy_frame == "body" else observation
+        if self.task.policy_frame == "world":
+            return observation
+        on_circle = self._integrator is not None and self._integrator.circle_m is not None
+        return quadrotor.in_body_frame(observation, horizontal=on_circle)
 
     def _start(self, params: Any, key: chex.PRNGKey) -> quadrotor.Body:
         return quadrotor.draw(params.start, key)
@@ -320,7 +323,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         if self.task.memory.previous_action:
             parts.append(plain.action)
         if self._integrator:
-            parts.append(jnp.eye(2) if self._integrator.circle_m else world)
+            parts += [jnp.eye(2), world[:2, :2]] if self._integrator.circle_m else [world]
         parts += [world, body, jnp.eye(plant.PRIVILEGED - 6), plain.action]
         return Symmetry(jax.scipy.linalg.block_diag(*parts), plain.action)
 

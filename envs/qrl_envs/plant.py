@@ -160,7 +160,7 @@ class Integrator(NamedTuple):
     @property
     def size(self) -> int:
         """k, the number of components of the error."""
-        return 2 if self.circle_m else 3
+        return 4 if self.circle_m else 3
 
 
 def integrator(task: QuadrotorTask) -> Integrator | None:
@@ -258,11 +258,14 @@ def integrated(total: chex.Array, position_m: chex.Array, integrator: Integrator
     if integrator is None:
         return total
     x, y, z = jnp.unstack(position_m)
-    if integrator.circle_m:
-        error = jnp.stack([(x * x + y * y - integrator.circle_m**2) / (2.0 * integrator.circle_m), z])
+    if radius_m := integrator.circle_m:
+        outside = (x * x + y * y - radius_m**2) / (2.0 * radius_m)
+        error = jnp.stack([outside, z, outside * x / radius_m, outside * y / radius_m])
+        square = outside**2 + z**2
     else:
         error = jnp.stack([x, y, z])
-    near = jnp.maximum(0.0, 1.0 - jnp.sum(error**2, axis=0) / integrator.radius_m**2)
+        square = jnp.sum(error**2, axis=0)
+    near = jnp.maximum(0.0, 1.0 - square / integrator.radius_m**2)
     return jnp.clip(total + dt_s * error * near**2, -integrator.limit_m_s, integrator.limit_m_s)
 
 

@@ -155,9 +155,10 @@ def observe(body: Body) -> chex.Array:
     return jnp.concatenate([*jnp.unstack(rotation.matrix(body.pose.attitude)), body.pose.position_m, *body.twist])
 
 
-def in_body_frame(observation: chex.Array) -> chex.Array:
+def in_body_frame(observation: chex.Array, horizontal: bool = False) -> chex.Array:
     """An observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
-    position [3], velocity [3], body rates [3]; then what follows them. [..., 18 + M] -> [..., 12 + M].
+    position [3], velocity [3], body rates [3]; then what follows them, of which the last two, with `horizontal`, are a
+    vector along the world's x and y, and three in the body frame. [..., 18 + M] -> [..., 12 + M or 13 + M].
     """
     numbers = jnp.unstack(observation[..., :18], axis=-1)
     rows, rates = (numbers[0:3], numbers[3:6], numbers[6:9]), numbers[15:18]
@@ -169,7 +170,11 @@ def in_body_frame(observation: chex.Array) -> chex.Array:
         ]
 
     body = jnp.stack([*rows[2], *turned(numbers[9:12]), *turned(numbers[12:15]), *rates], axis=-1)
-    return jnp.concatenate([body, observation[..., 18:]], axis=-1)
+    if not horizontal:
+        return jnp.concatenate([body, observation[..., 18:]], axis=-1)
+    x, y = observation[..., -2], observation[..., -1]
+    vector = jnp.stack([rows[0][j] * x + rows[1][j] * y for j in range(3)], axis=-1)
+    return jnp.concatenate([body, observation[..., 18:-2], vector], axis=-1)
 
 
 def draw(start: Start, key: chex.PRNGKey) -> Body:

@@ -42,7 +42,8 @@ class Integral(Spec):
     """The integral of the position error as an observation; far from the target, where it would wind up, it stands.
 
     dI/dt = e·max(0, 1 − |e|²/radius_m²)², within ±limit_m_s for each component. In hover e is the position; on a circle
-    of radius R, [(x² + y² − R²)/(2R), z]: near the circle, the distance to its radius, and the height.
+    of radius R, [E, z, E·x/R, E·y/R] with E = (x² + y² − R²)/(2R), near the circle the distance to its radius: a wrong
+    thrust moves E, a constant force along the world moves the circle's center. There |e|² is E² + z².
     """
 
     radius_m: Positive = 0.5

@@ -254,9 +254,11 @@ def test_on_a_circle_the_distance_to_its_radius_and_the_height_are_integrated() 
     """Whichever way the vehicle is from the center; 0.05 m outside of 2 m, 0.1 m below."""
     turn, distance_m = 0.7, 2.05
     position = jnp.array([distance_m * np.cos(turn), distance_m * np.sin(turn), -0.1])
-    after = plant.integrated(jnp.zeros(2), position, plant.Integrator(2.0, 0.5, 0.6), 0.1)
+    after = plant.integrated(jnp.zeros(4), position, plant.Integrator(2.0, 0.5, 0.6), 0.1)
     gate = (1 - (0.05**2 + 0.1**2) / 0.25) ** 2
-    np.testing.assert_allclose(after, [0.1 * gate * 0.05, -0.1 * gate * 0.1], rtol=0.03)  # to first order in 0.05 / 2
+    moved = 0.05 * np.array([np.cos(turn), np.sin(turn)])
+    wanted = 0.1 * gate * np.array([0.05, -0.1, *moved])
+    np.testing.assert_allclose(after, wanted, rtol=0.05)  # to first order in 0.05 / 2
 
 
 def test_in_the_body_frame_neither_heading_nor_azimuth_shows() -> None:
@@ -265,14 +267,18 @@ def test_in_the_body_frame_neither_heading_nor_azimuth_shows() -> None:
     assert isinstance(circle, task.QuadrotorTask)
     env = RealQuadrotorEnv(circle)
     state = jax.jit(env.reset)(jax.random.PRNGKey(0))
-    seen = np.asarray(state.obs[: env.policy_observation_size])
+    seen = np.array(state.obs[: env.policy_observation_size])
     to_body = seen[:9].reshape(3, 3).T
-    wanted = [to_body @ [0, 0, 1], to_body @ seen[9:12], to_body @ seen[12:15], seen[15:]]
+    seen[-2:] = 0.1, -0.2
+    moved = to_body @ [*seen[-2:], 0]
+    wanted = [to_body @ [0, 0, 1], to_body @ seen[9:12], to_body @ seen[12:15], seen[15:-2], moved]
     view = env.policy_view(jnp.asarray(seen))
     np.testing.assert_allclose(view, np.concatenate(wanted), atol=1e-6)
-    np.testing.assert_allclose(in_body_frame(seen[None])[0], view, atol=1e-6)
+    np.testing.assert_allclose(in_body_frame(seen[None], horizontal=True)[0], view, atol=1e-6)
     turn = Rotation.from_euler("z", 1.1).as_matrix()
-    other = np.concatenate([(turn @ to_body.T).ravel(), turn @ seen[9:12], turn @ seen[12:15], seen[15:]])
+    other = np.concatenate(
+        [(turn @ to_body.T).ravel(), turn @ seen[9:12], turn @ seen[12:15], seen[15:-2], turn[:2, :2] @ seen[-2:]]
+    )
     assert np.abs(other - seen).max() > 0.3
     np.testing.assert_allclose(env.policy_view(jnp.asarray(other)), view, atol=1e-5)
 
@@ -282,6 +288,6 @@ def test_the_policy_sees_the_first_numbers_and_the_critic_all() -> None:
     assert (env.policy_observation_size, env.observation_size, env.action_size) == (18 + 6 + 3, 18 + 6 + 3 + 14 + 6, 6)
     circle = task.load("circle", "hexa")
     assert isinstance(circle, task.QuadrotorTask)
-    assert RealQuadrotorEnv(circle).policy_observation_size == 18 + 6 + 2  # the integral of distance and height
+    assert RealQuadrotorEnv(circle).policy_observation_size == 18 + 6 + 4  # the integral of distance, height, center
     nothing = RealQuadrotorEnv(real_task("hexa", memory={}))
     assert nothing.policy_observation_size == 18

@@ -88,9 +88,12 @@ def literal_steps(policy: Policy, observations: np.ndarray) -> tuple[np.ndarray,
         if all(math.isfinite(x) for x in row):
             if integral:
                 e = [row[i] for i in integral.position]
-                if r := integral.circle_m:
-                    e = [(e[0] * e[0] + e[1] * e[1] - r * r) / (2 * r), e[2]]
-                gate = max(0.0, 1.0 - sum(x * x for x in e) / integral.radius_m**2) ** 2
+                r = integral.circle_m
+                if r:
+                    x, y, z = e
+                    outside = (x * x + y * y - r * r) / (2 * r)
+                    e = [outside, z, outside * x / r, outside * y / r]
+                gate = max(0.0, 1.0 - sum(x * x for x in (e[:2] if r else e)) / integral.radius_m**2) ** 2
                 for i in range(len(e)):
                     total[i] += policy.control_period_s * e[i] * gate
                     total[i] = min(max(total[i], -integral.limit_m_s), integral.limit_m_s)
@@ -164,10 +167,11 @@ def literal_integers(kernel: Kernel, x: list[int] | None, action: list[int], tot
         if circle := integral.circle:
             parts = zip(e[:2], circle.factor.tolist(), circle.shift.tolist(), strict=True)
             q = [limited(rounded(one * factor, shift), -32767, 32767) for one, factor, shift in parts]
-            e = [rounded(q[0] * q[0] + q[1] * q[1] - 2**28, 15), e[2]]
+            outside = rounded(q[0] * q[0] + q[1] * q[1] - 2**28, 15)
+            e = [outside, e[2], *(limited(rounded(outside * one, 14), -57344, 57344) for one in q)]
         k = range(integral.size)
         v = [rounded(e[i] * int(integral.inverse_radius[i]), int(integral.inverse_radius_shift[i])) for i in k]
-        w = max(0, 2**30 - sum(one * one for one in v)) // 2**15
+        w = max(0, 2**30 - sum(one * one for one in (v[:2] if integral.circle else v))) // 2**15
         gate = w * w // 2**15
         for i in k:
             more = rounded(e[i] * gate * int(integral.gain[i]) // 2**16, int(integral.gain_shift[i]))
@@ -183,6 +187,9 @@ def literal_integers(kernel: Kernel, x: list[int] | None, action: list[int], tot
     else:
         inputs = [rounded(q, int(shift)) for q, shift in zip(x, kernel.obs_shift, strict=True)]
     inputs += [limited(rounded(q, int(shift)), low, high) for q, shift, low, high in columns]
+    if kernel.turn:
+        *inputs, a, b = inputs
+        inputs += [rounded(x[j] * a // 2 + x[3 + j] * b // 2, 15) for j in range(3)]
     action[:] = reference.network(kernel, np.array([inputs]))[0].tolist()  # literal in test_kernel.py
 
 
@@ -284,7 +291,7 @@ def test_a_millimeter_from_the_circle_counts() -> None:
             state = reference.initial_state(kernel, 1)
             for _ in range(1000):
                 state, _, _ = reference.step(kernel, state, obs)
-            total = remembered(kernel, state)[0, -2:]
+            total = remembered(kernel, state)[0, -4:-2]
             each_m = total / (1000 * policy.control_period_s)
             np.testing.assert_allclose(each_m, [away_m, 0.0], rtol=0, atol=radius_m / 2**13)
 
@@ -668,7 +675,7 @@ def test_the_manifest_says_what_the_state_holds(which: str) -> None:
     found = json.loads(emit.files(policy, kernel, vectors.golden(policy, kernel), "ours")["manifest.json"])
     sizes, memory = REMEMBERING[which]
     assert (found["format"], found["name"], found["vehicle"]) == (2, "ours", None)
-    sizes_bytes = {"both": 20, "circle": 16, "action": 8, "integral": 12, "one action": 16, "odd": 16}
+    sizes_bytes = {"both": 20, "circle": 24, "action": 8, "integral": 12, "one action": 16, "odd": 16}
     assert found["state_bytes"] == sizes_bytes[which]
     assert found["network"] == [len(policy.layers[0][0]), *sizes[1:]]
     assert len(found["obs"]) == sizes[0]

@@ -150,13 +150,17 @@ def remembering(which: str = "both", activation: str = "relu") -> Policy:
         offset.append(np.zeros(memory.integral.size))
         gain.append(np.full(memory.integral.size, 2.0 / memory.integral.limit_m_s))
     (weight, bias), *hidden, (last, last_bias) = base.layers
-    more = rng.normal(size=(memory.size(actions), weight.shape[1])) * 0.5 * (2.0 / len(weight)) ** 0.5
+    rows = memory.size(actions) + (which == "circle")
+    more = rng.normal(size=(rows, weight.shape[1])) * 0.5 * (2.0 / len(weight)) ** 0.5
+    scale = rng.uniform(0.5, 1.0, memory.size(actions))
+    if which == "circle":
+        scale[-2:] = 0.7  # a vector: the same along x and y
     made = replace(
         base,
         memory=memory,
         observation_offset=np.concatenate(offset),
         observation_gain=np.concatenate(gain),
-        observation_scale=np.concatenate([base.observation_scale, rng.uniform(0.5, 1.0, memory.size(actions))]),
+        observation_scale=np.concatenate([base.observation_scale, scale]),
         layers=((np.concatenate([weight, more]), bias), *hidden, (last, last_bias)),
         calibration=np.concatenate(columns, axis=1).astype(np.float32),
     )
@@ -177,9 +181,9 @@ def outputs(policy: Policy, inputs: np.ndarray) -> np.ndarray:
     x = np.minimum(np.maximum(x, -policy.observation_clip), policy.observation_clip) * policy.observation_scale
     if policy.body_frame:
         to_body = [row[:9].reshape(3, 3).T for row in x]
-        x = np.array(
-            [[*row[6:9], *(m @ row[9:12]), *(m @ row[12:15]), *row[15:]] for m, row in zip(to_body, x, strict=True)]
-        )
+        turned = [[*row[6:9], *(m @ row[9:12]), *(m @ row[12:15])] for m, row in zip(to_body, x, strict=True)]
+        rest = [[*row[15:-2], *(m @ [row[-2], row[-1], 0.0])] for m, row in zip(to_body, x, strict=True)]
+        x = np.concatenate([turned, rest], axis=1)
     for i, (weight, bias) in enumerate(policy.layers):
         x = np.einsum("ni,io->no", x, weight) + bias
         if i < len(policy.layers) - 1:

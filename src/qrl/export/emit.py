@@ -144,9 +144,9 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "previous_action": str(int(kernel.memory is not None and kernel.memory.initial_action is not None)),
         "integral": str(kernel.memory.integral.size if kernel.memory and kernel.memory.integral else 0),
         "positions": str(len(kernel.memory.integral.position) if kernel.memory and kernel.memory.integral else 0),
-        "inputs": str(kernel.widths[0]),
-        "seen": str(kernel.widths[0] - (len(kernel.memory.shift) if kernel.memory else 0)),
+        "seen": str(len(reference.measured(kernel, kernel.obs_max[None])[0])),
         "turn": str(int(kernel.turn is not None)),
+        "kept": str(len(kernel.memory.shift) if kernel.memory else 0),
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(run.task),
         "ports": "\n".join(f" * {_comment_safe(line)}".rstrip() for line in _port_lines(policy, kernel)),
@@ -255,7 +255,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
 
 def _memory_tables(memory: Memory, prefix: str) -> list[str]:
     kept = (f"{{{s}, {low}, {high}}}" for s, low, high in zip(memory.shift, memory.low, memory.high, strict=True))
-    parts = [_array("struct kept kept[INPUTS - SEEN]", kept, 8)]
+    parts = [_array("struct kept kept[KEPT]", kept, 8)]
     if memory.initial_action is not None:
         parts.append(_array(f"int16_t act_first[{prefix}_ACT_SIZE]", memory.initial_action, 12))
     return parts

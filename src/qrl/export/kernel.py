@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 Ints = NDArray[np.int64]
 
 INT16 = 32767
+MOST_ERROR = 57344  # of a position on a circle, in steps
 TANH_RANGE = 6.0  # the table covers [−6, 6], in 256 intervals; tanh(6) = 1 − 1.2e-5
 
 
@@ -23,7 +24,8 @@ class Dense:
 
 @dataclass(frozen=True, eq=False)
 class Circle:
-    """The position's error on a circle about z, e = [E, z]: E = ⌊(q_x² + q_y² − 2²⁸) / 2¹⁵⌉ in steps of circle_m/2¹⁴.
+    """The position's error on a circle about z, e = [E, z, ⌊E·q_x / 2¹⁴⌉, ⌊E·q_y / 2¹⁴⌉], the last two within ±57344:
+    E = ⌊(q_x² + q_y² − 2²⁸) / 2¹⁵⌉ in steps of circle_m/2¹⁴. The gate is that of E and z.
 
     q_i = ⌊p_i·factor_i / 2^shift_i⌉ within ±32767: x and y, in steps of the observation's lsb, over the circle's
     diameter in 1/2¹⁵.
@@ -75,7 +77,8 @@ class Memory:
 class Turn:
     """The first inputs [12] of a network in the body frame, of a vehicle's 18 measurements x: ⌊x_i / 2^up⌉ of the third
     row of the rotation matrix; ⌊Σ_i ⌊r_ij·p_i / 2⌋ / 2^position⌉ of the position, likewise of the velocity, each within
-    ±32767; the body rates.
+    ±32767; the body rates. At the end, where the integral has a horizontal vector I, ⌊Σ_i ⌊r_ij·I_i / 2⌋ / 2¹⁵⌉ for its
+    inputs I.
     """
 
     up: int  # in [0, 15]
@@ -120,6 +123,12 @@ class Kernel:
         return np.concatenate(parts) * 2.0**self.memory.shift
 
     @property
+    def turns_integral(self) -> bool:
+        """Whether the integral's last two components are a horizontal vector, which is turned into the body frame."""
+        integral = self.memory and self.memory.integral
+        return self.turn is not None and integral is not None and integral.circle is not None
+
+    @property
     def input_limits(self) -> tuple[Ints, Ints]:
         """Smallest and largest of each of the network's inputs; [F + M]."""
         low, high = (shifted(limit, self.obs_shift) for limit in (self.obs_min, self.obs_max))
@@ -129,7 +138,11 @@ class Kernel:
             high = np.concatenate([shifted(high[6:9], self.turn.up), full, high[15:]])
         if self.memory is None:
             return low, high
-        return np.concatenate([low, self.memory.low]), np.concatenate([high, self.memory.high])
+        low, high = np.concatenate([low, self.memory.low]), np.concatenate([high, self.memory.high])
+        if self.turns_integral:
+            full = np.full(3, INT16)
+            low, high = np.concatenate([low[:-2], -full]), np.concatenate([high[:-2], full])
+        return low, high
 
     @property
     def widths(self) -> list[int]:
@@ -267,8 +280,10 @@ def integrated(integral: Integral, total: Ints, position: Ints) -> Ints:
     if circle := integral.circle:
         q = np.clip(shifted(position[:, :2] * circle.factor, circle.shift), -INT16, INT16)
         along = shifted((q * q).sum(axis=-1) - 2**28, 15)
-        error = np.stack([along, position[:, 2]], axis=-1)
-    v = shifted(error * integral.inverse_radius, integral.inverse_radius_shift)
+        moved = np.clip(shifted(along[:, None] * q, 14), -MOST_ERROR, MOST_ERROR)
+        error = np.concatenate([along[:, None], position[:, 2:], moved], axis=-1)
+    gating = slice(0, 2 if integral.circle else None)
+    v = shifted(error * integral.inverse_radius, integral.inverse_radius_shift)[:, gating]
     w = np.maximum(2**30 - np.minimum(v * v, 2**30).sum(axis=-1, keepdims=True), 0) >> 15
     gate = w * w >> 15
     more = shifted(error * gate * integral.gain >> 16, integral.gain_shift)
@@ -295,7 +310,16 @@ def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
     if kernel.memory is None:
         return first
     kept = np.clip(shifted(state, kernel.memory.shift), kernel.memory.low, kernel.memory.high)
-    return np.concatenate([first, kept], axis=-1)
+    return np.concatenate([first, remembered(kernel, kept, x)], axis=-1)
+
+
+def remembered(kernel: Kernel, kept: Ints, x: Ints) -> Ints:
+    """The network's last inputs, for those of the memory [n, M] and saturated observations x [n, F]."""
+    if not kernel.turns_integral:
+        return kept
+    rotation = x[:, :6].reshape(-1, 2, 3)
+    vector = shifted((rotation * kept[:, -2:, None] >> 1).sum(axis=1), 15)
+    return np.concatenate([kept[:, :-2], vector], axis=-1)
 
 
 def _act(kernel: Kernel, state: Ints, x: Ints) -> tuple[Ints, Ints]:

@@ -53,8 +53,8 @@ class Integral:
     """The integral of the error e of the measured position p, gated: far away it stands still and cannot wind up.
 
     I_k = clip(I_{k−1} + control period·g(e_k), ±limit_m_s) per component, I = 0 after a reset;
-    g(e) = e·max(0, 1 − |e|²/radius²)². To hover, e = p. On a circle about z, e = [(x² + y² − circle²)/(2·circle), z]:
-    near the circle its first component is the distance to the circle's radius.
+    g(e) = e·max(0, 1 − |e|²/radius²)². To hover, e = p. On a circle about z of radius R, e = [E, z, E·x/R, E·y/R] with
+    E = (x² + y² − R²)/(2R), near the circle the distance to its radius; there |e|² is E² + z².
     """
 
     position: tuple[int, ...]  # indices of p in the observation: on a circle of x, y, z
@@ -65,15 +65,21 @@ class Integral:
     @property
     def size(self) -> int:
         """k, the number of components."""
-        return len(self.position) if self.circle_m is None else 2
+        return len(self.position) if self.circle_m is None else 4
 
     def error(self, position: NDArray[np.floating]) -> NDArray[np.float64]:
         """e [n, k] of positions p [n, 3]."""
         p = np.asarray(position, np.float64)
         if self.circle_m is None:
             return p
-        along = ((p[:, :2] ** 2).sum(axis=-1) - self.circle_m**2) / (2.0 * self.circle_m)
-        return np.stack([along, p[:, 2]], axis=-1)
+        x, y, z = p.T
+        outside = (x**2 + y**2 - self.circle_m**2) / (2.0 * self.circle_m)
+        return np.stack([outside, z, outside * x / self.circle_m, outside * y / self.circle_m], axis=-1)
+
+    def gate(self, error: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What of errors e [n, k] is integrated; [n, 1]."""
+        part = error if self.circle_m is None else error[:, :2]
+        return np.maximum(0.0, 1.0 - (part**2).sum(axis=-1, keepdims=True) / self.radius_m**2) ** 2
 
 
 @dataclass(frozen=True)
@@ -94,14 +100,18 @@ class Memory:
 WORLD_SIZE, BODY_SIZE = 18, 12  # numbers of a vehicle's measurements, and of these in the body frame
 
 
-def in_body_frame(observation: NDArray[np.floating]) -> NDArray[np.float64]:
+def in_body_frame(observation: NDArray[np.floating], horizontal: bool) -> NDArray[np.float64]:
     """The observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
-    position [3], velocity [3], body rates [3]; then what follows them. [n, 18 + M] -> [n, 12 + M].
+    position [3], velocity [3], body rates [3]; then what follows them, of which the last two, with `horizontal`, are a
+    vector along the world's x and y, and three in the body frame. [n, 18 + M] -> [n, 12 + M or 13 + M].
     """
     o = np.asarray(observation, np.float64)
     rotation = o[:, :9].reshape(-1, 3, 3)
     turned = [np.einsum("nij,ni->nj", rotation, o[:, at : at + 3]) for at in (9, 12)]
-    return np.concatenate([o[:, 6:9], *turned, o[:, 15:]], axis=-1)
+    if not horizontal:
+        return np.concatenate([o[:, 6:9], *turned, o[:, 15:]], axis=-1)
+    vector = np.einsum("nij,ni->nj", rotation[:, :2], o[:, -2:])
+    return np.concatenate([o[:, 6:9], *turned, o[:, 15:-2], vector], axis=-1)
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outputs], bias [outputs]
@@ -133,17 +143,27 @@ class Policy:
         """Action in SI units; [n, I] -> [n, A]. Of a policy without memory the inputs are the observation."""
         x = (inputs - self.observation_offset) * self.observation_gain
         x = np.clip(x, -self.observation_clip, self.observation_clip) * self.observation_scale
-        x = in_body_frame(x) if self.body_frame else x
+        x = self.seen(x)
         for weight, bias in self.layers[:-1]:
             x = ACTIVATIONS[self.activation](x @ weight + bias)
         weight, bias = self.layers[-1]
         return self.to_si(x @ weight + bias)
 
     @property
+    def turns_integral(self) -> bool:
+        """Whether the integral's last two components are turned into the body frame."""
+        integral = self.memory and self.memory.integral
+        return self.body_frame and integral is not None and integral.circle_m is not None
+
+    def seen(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
+        """What the network is given of inputs [n, I], scaled or not."""
+        return in_body_frame(inputs, self.turns_integral) if self.body_frame else np.asarray(inputs, np.float64)
+
+    @property
     def input_gain(self) -> NDArray[np.float64]:
         """The network's inputs over those in SI units; one for each row of its first layer."""
         gain = self.observation_gain * self.observation_scale
-        return np.concatenate([gain[6:WORLD_SIZE], gain[WORLD_SIZE:]]) if self.body_frame else gain
+        return np.concatenate([gain[6:], gain[-1:]] if self.turns_integral else [gain[6:]]) if self.body_frame else gain
 
     @property
     def memory_size(self) -> int:
@@ -182,8 +202,7 @@ class Policy:
         assert self.memory.integral
         integral = self.memory.integral
         e = integral.error(observation[:, list(integral.position)])
-        gate = np.maximum(0.0, 1.0 - (e**2).sum(axis=-1, keepdims=True) / integral.radius_m**2) ** 2
-        return np.clip(total + self.control_period_s * gate * e, -integral.limit_m_s, integral.limit_m_s)
+        return np.clip(total + self.control_period_s * integral.gate(e) * e, -integral.limit_m_s, integral.limit_m_s)
 
     def to_si(self, a: NDArray[np.floating]) -> NDArray[np.float64]:
         """Action [..., A] in SI units of the network's output a."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
-from qrl.export.policy import ACTIVATIONS, BODY_SIZE, WORLD_SIZE, Layer, Policy, in_body_frame
+from qrl.export.policy import ACTIVATIONS, BODY_SIZE, WORLD_SIZE, Layer, Policy
 
 Floats = NDArray[np.float64]
 
@@ -66,18 +66,21 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     clip = policy.observation_clip / policy.observation_gain
     floor, ceiling = policy.observation_offset - clip, policy.observation_offset + clip
     inputs = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
-    x_float = in_body_frame(inputs) if policy.body_frame else inputs
+    x_float = policy.seen(inputs)
     measured = len(policy.observations)
     low, high = policy.limits
     act_lsb = (np.maximum(np.abs(low), np.abs(high)) / INT16).astype(np.float32)
     act_min, act_max = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
     remembered = _memory_lsb(policy, act_lsb) * INT16
     ranges = _ranges(inputs[:, :measured], policy.body_frame)
-    seen = _ranges(x_float[:, : x_float.shape[1] - len(remembered)], same_axes=False) if policy.body_frame else ranges
-    wanted = _steps(np.concatenate([seen, remembered]), layers[0][0], MIN_LEVELS)
+    seen = _ranges(x_float[:, :BODY_SIZE], same_axes=False) if policy.body_frame else ranges
+    last = np.append(remembered, remembered[-1]) if policy.turns_integral else remembered
+    wanted = _steps(np.concatenate([seen, last]), layers[0][0], MIN_LEVELS)[: len(seen) + len(remembered)]
     # What is integrated, remembered or turned has the finest step; a coarser one of the network's input is a shift.
     shift = np.floor(np.log2(wanted / (np.concatenate([seen, remembered]) / INT16)) + 1e-9).astype(np.int64)
     remembered_shift, seen_shift = shift[len(seen) :], shift[: len(seen)]
+    if policy.turns_integral:
+        remembered_shift[-2:] = remembered_shift[-2:].min()
     finest = ranges / INT16
     if policy.body_frame:
         steps = np.concatenate([finest[:15], wanted[9:12]])
@@ -92,7 +95,10 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     first_step, turn = lsb * 2.0**obs_shift, None
     if policy.body_frame:
         turn, first_step = _turn(lsb, wanted)
-    step = np.concatenate([first_step, remembered / INT16 * 2.0**remembered_shift])
+    last_step = remembered / INT16 * 2.0**remembered_shift
+    if policy.turns_integral:
+        last_step = np.concatenate([last_step[:-2], np.full(3, 2.0**16 * lsb[0] * last_step[-1])])
+    step = np.concatenate([first_step, last_step])
     kernel = Kernel(
         scale=scale,
         exponent=exponent,
@@ -161,10 +167,12 @@ def respond(kernel: Kernel, x: NDArray[np.floating]) -> NDArray[np.float32]:
     """Actions [n, A] of the kernel for the network's inputs [n, I] in SI units."""
     measured = len(kernel.scale)
     unclipped, _ = integers.quantized(kernel, x[:, :measured].astype(np.float32))
-    q = integers.measured(kernel, np.clip(unclipped, kernel.obs_min, kernel.obs_max))
+    saturated = np.clip(unclipped, kernel.obs_min, kernel.obs_max)
+    q = integers.measured(kernel, saturated)
     if kernel.memory:
         kept = np.round(x[:, measured:] / kernel.memory_steps)
-        q = np.concatenate([q, np.clip(kept, kernel.memory.low, kernel.memory.high).astype(np.int64)], axis=-1)
+        kept = np.clip(kept, kernel.memory.low, kernel.memory.high).astype(np.int64)
+        q = np.concatenate([q, integers.remembered(kernel, kept, saturated)], axis=-1)
     return integers.network(kernel, q).astype(np.float32) * kernel.act_lsb
 
 
@@ -207,7 +215,7 @@ def _integral(policy: Policy, lsb: Floats) -> tuple[integers.Integral, int]:
     steps, circle = lsb[list(position)], None
     if circle_m is not None:
         circle = integers.Circle(*_as_factor(steps[:2] / (2.0 * circle_m) * 2.0**15))
-        steps = np.array([circle_m / 2.0**14, steps[2]])
+        steps = np.array([circle_m / 2.0**14, steps[2], *[circle_m / 2.0**14] * 2])
     increment = policy.control_period_s * steps / (limit / INT16)  # at one step of the position, ungated
     bits = int(np.clip(np.ceil(13.0 - np.log2(increment.max())) - 1.0, 0, INTEGRAL_BITS))
     if increment.max() >= 2.0**13 or increment.min() * 2.0**bits < 1.0:
@@ -248,7 +256,7 @@ def _check(policy: Policy) -> None:
         raise UnsupportedNetwork("a memory that holds nothing")
     expected = len(policy.observations) + policy.memory_size
     if policy.body_frame:
-        expected -= WORLD_SIZE - BODY_SIZE
+        expected += BODY_SIZE - WORLD_SIZE + policy.turns_integral
         if len(policy.observations) != WORLD_SIZE or np.any(policy.observation_offset[:WORLD_SIZE]):
             raise UnsupportedNetwork("the body frame: expected a vehicle's 18 observations, not standardized")
     if len(policy.layers[0][0]) != expected:
@@ -262,7 +270,9 @@ def si_layers(policy: Policy) -> list[Layer]:
     layers = [(weight.astype(np.float64), bias.astype(np.float64)) for weight, bias in policy.layers]
     weight, bias = layers[0]
     weight = weight * policy.input_gain[:, None]
-    offset = policy.observation_offset[WORLD_SIZE - BODY_SIZE if policy.body_frame else 0 :]
+    offset = policy.observation_offset
+    if policy.body_frame:
+        offset = np.append(offset[WORLD_SIZE - BODY_SIZE :], [0.0] * policy.turns_integral)
     layers[0] = weight, bias - offset @ weight
     weight, bias = layers[-1]
     layers[-1] = weight * policy.scale, bias * policy.scale + policy.offset

@@ -65,9 +65,9 @@ typedef uint16_t factors;
 #define INTEGRAL @integral@        /* then the integral of so many components of the error, */
 #define POSITIONS @positions@       /* which follows from so many coordinates of the position */
 #define MEMORY (PREVIOUS_ACTION || INTEGRAL)
-#define INPUTS @inputs@
 #define SEEN @seen@ /* inputs of the network that follow from the observation */
 #define TURN @turn@ /* whether they are in the body frame */
+#define KEPT @kept@ /* inputs that are remembered */
 
 union activations {
     activation one[@widest@];
@@ -362,26 +362,31 @@ static inline int32_t shifted(int32_t x, int shift) {
 #if INTEGRAL
 
 #ifdef CIRCLE
-/* A coordinate over the diameter of the circle, squared, in 1 / 2^30. */
-static int32_t squared(int32_t p, const struct factor *d) {
-    const int32_t q = limited(shifted(p * d->factor, d->shift), -32767, 32767);
-    return q * q;
+#define GATING 2
+/* A coordinate over the diameter of the circle, in 1 / 2^15. */
+static int32_t over(int32_t p, const struct factor *d) {
+    return limited(shifted(p * d->factor, d->shift), -32767, 32767);
 }
+#else
+#define GATING INTEGRAL
 #endif
 
 /* integral += period * e * max(0, 1 - |e|^2 / radius^2)^2, within its limits. The error e is the position among the
-   inputs; on a circle of radius c it is (x^2 + y^2 - c^2) / (2 c) and z. */
+   inputs; on a circle of radius c it is o = (x^2 + y^2 - c^2) / (2 c), z, o x / c and o y / c, with o and z in |e|. */
 static void integrate(int32_t integral[INTEGRAL], union activations *x) {
-    int32_t e[POSITIONS], inside = (int32_t)1 << 30; /* 1 - |e|^2 / radius^2, in 1 / 2^30 */
+    int32_t e[POSITIONS > INTEGRAL ? POSITIONS : INTEGRAL], inside = (int32_t)1 << 30; /* 1 - |e|^2 / radius^2, in 1 / 2^30 */
     for (int i = 0; i < POSITIONS; ++i) {
         e[i] = (int32_t)x->one[positions[i].input] - OFFSET;
         x->one[positions[i].input] = (activation)(shifted(e[i], positions[i].shift) + OFFSET);
     }
 #ifdef CIRCLE
-    e[0] = shifted(squared(e[0], diameter) - ((int32_t)1 << 28) + squared(e[1], diameter + 1), 15);
+    const int32_t x_of = over(e[0], diameter), y_of = over(e[1], diameter + 1);
+    e[0] = shifted(x_of * x_of - ((int32_t)1 << 28) + y_of * y_of, 15);
     e[1] = e[2];
+    e[2] = limited(shifted(e[0] * x_of, 14), -57344, 57344);
+    e[3] = limited(shifted(e[0] * y_of, 14), -57344, 57344);
 #endif
-    for (int i = 0; i < INTEGRAL; ++i) {
+    for (int i = 0; i < GATING; ++i) {
         const int32_t v = shifted(e[i] * errors[i].inverse_radius, errors[i].inverse_radius_shift);
         inside -= v >= 32768 || v <= -32768 ? (int32_t)1 << 30 : v * v;
     }
@@ -398,10 +403,10 @@ static void integrate(int32_t integral[INTEGRAL], union activations *x) {
 #if TURN
 
 /* A vector of the world in the body frame. */
-static void turned(activation y[3], const int32_t r[9], const activation v[3], int shift) {
+static void turned(activation y[3], const int32_t r[9], const activation v[], int numbers, int shift) {
     for (int j = 0; j < 3; ++j) {
         int32_t sum = 0;
-        for (int i = 0; i < 3; ++i) {
+        for (int i = 0; i < numbers; ++i) {
             sum += (r[3 * i + j] * ((int32_t)v[i] - OFFSET)) >> 1;
         }
         y[j] = (activation)(limited(shifted(sum, shift), -32767, 32767) + OFFSET);
@@ -409,16 +414,15 @@ static void turned(activation y[3], const int32_t r[9], const activation v[3], i
 }
 
 /* The observation, rotation matrix, position, velocity and body rates, as it is in the body frame, without heading. */
-static void turn(union activations *x) {
-    int32_t r[9];
+static void turn(union activations *x, int32_t r[9]) {
     for (int i = 0; i < 9; ++i) {
         r[i] = (int32_t)x->one[i] - OFFSET;
     }
     for (int i = 0; i < 3; ++i) {
         x->one[i] = (activation)(shifted(r[6 + i], UP_SHIFT) + OFFSET);
     }
-    turned(x->one + 3, r, x->one + 9, POSITION_SHIFT);
-    turned(x->one + 6, r, x->one + 12, VELOCITY_SHIFT);
+    turned(x->one + 3, r, x->one + 9, 3, POSITION_SHIFT);
+    turned(x->one + 6, r, x->one + 12, 3, VELOCITY_SHIFT);
     for (int i = 9; i < 12; ++i) {
         x->one[i] = x->one[i + 6];
     }
@@ -433,10 +437,11 @@ static void complete(union activations *x, @name@_state *state) {
     integrate(state->integral, x);
 #endif
 #if TURN
-    turn(x);
+    int32_t r[9];
+    turn(x, r);
 #endif
 #if MEMORY
-    for (const struct kept *k = kept; i < INPUTS; ++i, ++k) {
+    for (const struct kept *k = kept; k != kept + KEPT; ++i, ++k) {
         const int at = i - SEEN;
 #if PREVIOUS_ACTION && INTEGRAL
         const int32_t value = at < @NAME@_ACT_SIZE ? state->previous_action[at] : state->integral[at - @NAME@_ACT_SIZE];
@@ -447,6 +452,11 @@ static void complete(union activations *x, @name@_state *state) {
 #endif
         x->one[i] = (activation)(limited(shifted(value, k->shift), k->least, k->most) + OFFSET);
     }
+#if TURN && defined(CIRCLE) /* the last two are a horizontal vector */
+    const activation horizontal[2] = {x->one[i - 2], x->one[i - 1]};
+    turned(x->one + i - 2, r, horizontal, 2, 15);
+    ++i;
+#endif
 #else
     (void)state;
 #endif
