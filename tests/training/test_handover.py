@@ -119,6 +119,15 @@ def test_what_does_not_fly_learns_on_and_another_beside_it_does_not(pair: tuple[
     assert states.buffer.inserted.tolist() == [26, 12]
 
 
+def test_a_bounded_gradient_takes_over_from_what_does_not_fly() -> None:
+    """It learns from flights that go wrong, so nothing is waited for."""
+    bounded = CONFIG.model_copy(update={"apg_cotangent_norm": 10.0})
+    states, inputs, programs = start([CRASHES])
+    made = list(driver.run_chunks(states, inputs, programs, bounded, Clock(), lambda: False))
+    assert made[-1].env_steps == CONFIG.num_timesteps
+    assert not any(chunk.extended for chunk in made)
+
+
 def assert_close(ours: TrainState, expected: TrainState) -> None:
     for (path, x), y in zip(jax.tree.leaves_with_path(ours), jax.tree.leaves(expected), strict=True):
         name = jax.tree_util.keystr(path)
