@@ -3,7 +3,9 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from brax.envs.fast import Fast
@@ -153,6 +155,25 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
     memory, action = policy.step(inputs[:, 2:], inputs[:, :2])
     np.testing.assert_allclose(action, wanted, atol=1e-5)
     np.testing.assert_array_equal(memory, action)
+
+
+def test_a_circle_of_a_real_vehicle_exports(tmp_path: Path) -> None:
+    """In the body frame, with all memory: the policy is the one that was trained, and the kernel is verified."""
+    run = tmp_path / "run"
+    assert qrl("train", "circle", "--vehicle", "crazyflie", "--out", run, *TINY.split()) == 0
+    loaded = TrainedRun.load(run)
+    policy = loaded.float_policy()
+    assert policy.turns_integral
+    env: Any = loaded.env
+    seen = np.array(jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
+    seen[:, 18:26] = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 8))
+    wanted = policy.to_si(np.asarray(loaded.policy_mean(seen)))
+    assert np.ptp(wanted, axis=0).min() > 1e-4
+    np.testing.assert_allclose(policy(inputs_in_si(policy, seen)), wanted, atol=1e-6)
+    assert qrl("export", run, *LEAST) == 0
+    manifest = json.loads((run / "export" / "manifest.json").read_text())
+    assert manifest["network"][0] == 12 + 4 + 5
+    assert manifest["memory"]["integral"]["circle_m"] == 1.0
 
 
 @pytest.mark.parametrize("name", shipped_vehicles())
