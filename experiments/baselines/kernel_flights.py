@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 PERIOD_S = 0.01  # of control: that of the kernels, and RAPTOR's
 DURATION_S, TAIL_S = 8.0, 2.0
 SUCCESS_M = 0.1  # distance from the point, throughout the tail
-LOST_M, LOST_RAD_S = 50.0, 200.0  # distance and body rate at which a flight is over
+LOST_M, LOST_RAD_S = 20.0, 200.0  # distance and body rate at which a flight is over
 STARTS_SEED = 20261128
 RAPTOR_MOST_M, RAPTOR_MOST_M_S = 0.5, 1.0  # to which PX4's mc_raptor clips the errors that RAPTOR is shown
 
@@ -294,14 +294,13 @@ def summary(distances: Array) -> dict[str, float]:
 
 
 def tournament(
-    simulator: Callable[[Condition], Simulator], controllers: dict[str, Controller], starts: int
+    simulator: Callable[[Condition, str], Simulator], controllers: dict[str, Controller], starts: int
 ) -> None:
-    """Report a line for each kind of starts, condition and controller."""
+    """Report a line for each kind of starts, condition and controller; `simulator`: of a condition and a controller."""
     for kind, draw in STARTS.items():
         for condition in CONDITIONS:
-            judge = simulator(condition)
             for name, controller in controllers.items():
-                found = summary(fly(judge, controller, draw(starts)))
+                found = summary(fly(simulator(condition, name), controller, draw(starts)))
                 report({"starts": kind, "flights": starts, "condition": condition.name, "controller": name} | found)
 
 

@@ -47,7 +47,7 @@ class Staged(Multirotor):
             return force, moment
         speeds = np.full_like(rotor_speeds, self._hover_rad_s) if self._stage == 1 else rotor_speeds
         air = np.tile(body_airspeed_vector, (self.num_rotors, 1))
-        if self._stage == 2 or self._stage == 1:
+        if self._stage < 3:
             return force - (speeds[:, None] * air * np.diag(self.rotor_drag_matrix)).sum(axis=0), moment
         air = air + np.cross(body_rates, self.rotor_geometry)
         hub = -speeds[:, None] * air * np.diag(self.rotor_drag_matrix)
@@ -133,7 +133,7 @@ def main() -> None:
         controllers["qrl"] = KernelController(job.kernel, theirs, speed_of)
     least, most = parameters["rotor_speed_min"], parameters["rotor_speed_max"]
     controllers |= {"RAPTOR": RaptorController(theirs, least, most), "rotorpy's SE3": SE3(parameters)}
-    kernel_flights.tournament(lambda condition: Flights(parameters, condition), controllers, job.starts)
+    kernel_flights.tournament(lambda condition, _: Flights(parameters, condition), controllers, job.starts)
 
 
 if __name__ == "__main__":
