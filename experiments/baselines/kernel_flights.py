@@ -251,10 +251,9 @@ def fly(simulator: Simulator, controller: Controller, starts: Start, duration_s:
     simulator.start(starts.states())
     controller.reset(count)
     flying = np.ones(count, bool)
-    distances = []
+    states, distances = starts.states(), []
     with np.errstate(all="ignore"):  # a lost flight may overflow
         for _ in range(round(duration_s / PERIOD_S)):
-            states = simulator.states()
             simulator.step(controller.act(_level_where_lost(states, flying)), flying)
             states = simulator.states()
             distance = np.linalg.norm(states.position_m, axis=1)
