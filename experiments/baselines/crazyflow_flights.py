@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from crazyflow.control import Control
 from crazyflow.control.transform import motor_force2rotor_vel
-from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.drones import Drone
+from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
 from numpy.typing import NDArray

@@ -15,8 +15,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from judge import report
-
 Array = NDArray[np.float64]
 
 PERIOD_S = 0.01  # of control: that of the kernels, and RAPTOR's
@@ -111,7 +109,7 @@ def observations(states: State) -> NDArray[np.float32]:
 
 
 class Kernel:
-    """An exported kernel (format 2) in a shared library, with a memory for each flight; motor thrusts [N] in newtons."""
+    """An exported kernel (format 2) in a shared library, with a memory for each flight."""
 
     def __init__(self, library: Path, manifest: Path) -> None:
         said = json.loads(manifest.read_text(encoding="utf-8"))
@@ -246,7 +244,7 @@ STARTS = {"moderate": moderate, "any attitude": any_attitude}
 
 
 def fly(simulator: Simulator, controller: Controller, starts: Start, duration_s: float = DURATION_S) -> Array:
-    """Distances from the point [n, steps] in meters, after each control period; infinite from where a flight was lost."""
+    """Distances from the point [n, steps] in meters after each period; infinite once lost."""
     count = len(starts.quaternion)
     simulator.start(starts.states())
     controller.reset(count)
@@ -266,12 +264,7 @@ def fly(simulator: Simulator, controller: Controller, starts: Start, duration_s:
 def _level_where_lost(states: State, flying: NDArray[np.bool_]) -> State:
     """`states` with those of lost flights replaced by a vehicle that hovers, so that controllers are passed numbers."""
     still = State(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    return State(
-        *(
-            np.where(flying.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-            for a, b in zip(states, still, strict=True)
-        )
-    )
+    return State(*(np.where(flying.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(states, still, strict=True)))
 
 
 def summary(distances: Array) -> dict[str, float]:
@@ -296,6 +289,8 @@ def tournament(
     simulator: Callable[[Condition, str], Simulator], controllers: dict[str, Controller], starts: int
 ) -> None:
     """Report a line for each kind of starts, condition and controller; `simulator`: of a condition and a controller."""
+    from judge import report  # beside this file, where it is a script's; experiments.bench.judges needs no clock
+
     for kind, draw in STARTS.items():
         for condition in CONDITIONS:
             for name, controller in controllers.items():

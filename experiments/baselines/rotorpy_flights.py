@@ -70,8 +70,10 @@ class Flights:
             "k_m": parameters["k_m"] * condition.thrust,
             "tau_m": parameters["tau_m"] * condition.lag,
         }
-        self._vehicle = Staged(changed, stage) if stage in STAGES[:-1] else Multirotor(
-            changed, integrator_kwargs=EXACT if stage else USUAL
+        self._vehicle = (
+            Staged(changed, stage)
+            if stage in STAGES[:-1]
+            else Multirotor(changed, integrator_kwargs=EXACT if stage else USUAL)
         )
         self._hover_rad_s, self._wind_m_s = hover_speed_rad_s(parameters), np.array([condition.wind_m_s, 0.0, 0.0])
         self._states: list[dict[str, Array]] = []
