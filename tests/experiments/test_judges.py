@@ -67,4 +67,6 @@ def test_our_plant_hovers_under_the_thrusts_of_hover() -> None:
     np.testing.assert_allclose(there.position_m, 0.0, atol=1e-5)
     np.testing.assert_allclose(there.rotation, np.broadcast_to(np.eye(3), there.rotation.shape), atol=1e-5)
     left = hover * np.array([1.0, 1.1, 1.1, 1.0])  # more on the right: rolls to the left, about −x
-    assert judges.ours(vehicle, given._replace(starts=still, thrusts_N=left), drag=True).body_rate_rad_s[0, -1, 0] < -0.1
+    assert (
+        judges.ours(vehicle, given._replace(starts=still, thrusts_N=left), drag=True).body_rate_rad_s[0, -1, 0] < -0.1
+    )
