@@ -9,6 +9,7 @@ import os
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")  # before SciPy is imported: crazyflow rotates JAX arrays with it
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -158,21 +159,19 @@ class Mellinger:
         return np.tile(wanted, (len(states.position_m), 1))
 
 
-def staged(vehicle: Vehicle, flights: int) -> dict[str, Flights]:
-    """The plant at each of STAGES."""
-    nominal = Flights(vehicle, flights, Control.rotor_vel).nominal
+def staged(vehicle: Vehicle, flights: int) -> Iterator[tuple[str, Flights]]:
+    """The plant at each of STAGES, to be used before the next one is asked for."""
+    rk4, euler = (Flights(vehicle, flights, Control.rotor_vel, i) for i in (Integrator.rk4, Integrator.euler))
     rise, fall = vehicle.rates_1_s()
     changes: dict[str, Any] = {
-        "rpm2torque": nominal.rpm2thrust * vehicle.yaw_moment_m(),
+        "rpm2torque": euler.nominal.rpm2thrust * vehicle.yaw_moment_m(),
         "rotor_dyn_coef": jnp.array([[rise, 0.0, fall, 0.0]]),
-        "prop_inertia": jnp.zeros_like(nominal.prop_inertia),
+        "prop_inertia": jnp.zeros_like(euler.nominal.prop_inertia),
     }
-    found = {}
-    for stage, theirs in zip(STAGES, ("", *list(changes), ""), strict=True):
+    for stage, theirs in zip(STAGES[:-1], ("", *list(changes)), strict=True):
         changes.pop(theirs, None)
-        integrator = Integrator.euler if stage == STAGES[-1] else Integrator.rk4
-        found[stage] = Flights(vehicle, flights, Control.rotor_vel, integrator).change(**changes)
-    return found
+        yield stage, rk4.change(**changes)
+    yield STAGES[-1], euler
 
 
 def main() -> None:
@@ -180,8 +179,8 @@ def main() -> None:
     vehicle = Vehicle(job.vehicle)
     if job.given and job.rollouts:
         given = kernel_flights.read_given(job.given)
-        flights = staged(vehicle, len(given.thrusts_N))
-        found = {s: kernel_flights.rollout(f, given, vehicle.rotors, vehicle.speed_of) for s, f in flights.items()}
+        stages = staged(vehicle, len(given.thrusts_N))
+        found = {s: kernel_flights.rollout(f, given, vehicle.rotors, vehicle.speed_of) for s, f in stages}
         kernel_flights.write_rollouts(job.rollouts, found)
         return
     controllers: dict[str, Controller] = {}

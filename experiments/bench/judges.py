@@ -215,8 +215,8 @@ def differences(stage: str, theirs: State, ours: State) -> list[Difference]:
     found = []
     for after_s in SHOWN_S:
         a, b = (State(*(field[:, round(after_s / PERIOD_S) - 1] for field in state)) for state in (theirs, ours))
-        trace = np.einsum("nij,nij->n", a.rotation, b.rotation)
-        angle = np.degrees(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
+        chord = np.linalg.norm(a.rotation - b.rotation, axis=(1, 2)) / 8.0**0.5  # sine of half the angle
+        angle = np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0)))
         apart = [np.linalg.norm(x - y, axis=1) for x, y in zip(a[1:], b[1:], strict=True)]
         position, velocity, rate = (float(np.sqrt((x**2).mean())) for x in apart)
         angle = float(np.sqrt((angle**2).mean()))

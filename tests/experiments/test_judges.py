@@ -70,3 +70,13 @@ def test_our_plant_hovers_under_the_thrusts_of_hover() -> None:
     assert (
         judges.ours(vehicle, given._replace(starts=still, thrusts_N=left), drag=True).body_rate_rad_s[0, -1, 0] < -0.1
     )
+
+
+def test_differences_of_plants_are_in_the_units_that_are_said() -> None:
+    def after(angle_rad: float, moved: float) -> State:
+        turned = np.array([[np.cos(angle_rad / 2), 0.0, np.sin(angle_rad / 2), 0.0]])
+        rotation = np.broadcast_to(kernel_flights.matrices(turned), (2, 30, 3, 3))
+        return State(rotation, *(np.broadcast_to([moved, 0.0, 0.0], (2, 30, 3)) for _ in range(3)))
+
+    first, *_ = judges.differences("stage", after(np.radians(3.0), 0.002), after(0.0, 0.0))
+    assert first[1:] == pytest.approx((0.01, 2.0, 2.0, 3.0, 0.002))
