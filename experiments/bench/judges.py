@@ -31,7 +31,7 @@ from qrl.runs import files
 from qrl.runs import record as records
 from qrl_envs import plant, quadrotor, rotors
 from qrl_envs.quadrotor import Body, Disturbance, Pose, Twist
-from qrl_envs.task import load
+from qrl_envs.task import QuadrotorTask, load
 from qrl_envs.vehicle import Vehicle
 
 BASELINES = Path(__file__).resolve().parents[1] / "baselines"
@@ -169,6 +169,13 @@ def fly(contestant: Contestant, python: Path, words: list[str]) -> tuple[list[di
 # ---- the plants, step by step ----------------------------------------------------------------------------
 
 
+def vehicle_of(name: str) -> Vehicle:
+    """Our file of that name."""
+    task = load("hover", name)
+    assert isinstance(task, QuadrotorTask)
+    return task.vehicle
+
+
 def given_for(vehicle: Vehicle) -> Given:
     """Moderate starts, and thrusts about those of hover that change every HELD_STEPS."""
     low, high = (np.array([getattr(motor, name) for motor in vehicle.motors]) for name in ("min_N", "max_N"))
@@ -226,8 +233,7 @@ def differences(stage: str, theirs: State, ours: State) -> list[Difference]:
 
 def compare(contestant: Contestant, python: Path, name: str, folder: Path) -> list[Difference]:
     """Both plants open loop, the judge's stage by stage; none where the judge's script fails."""
-    task = load("hover", name)
-    vehicle: Vehicle = task.vehicle  # pyright: ignore[reportAttributeAccessIssue]: hover flies one
+    vehicle = vehicle_of(name)
     given = given_for(vehicle)
     asked, answered = (folder.absolute() / f"{contestant.words[0]}-{word}.npz" for word in ("given", "rollouts"))
     np.savez(

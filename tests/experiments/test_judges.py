@@ -6,7 +6,6 @@ import pytest
 from experiments.baselines import kernel_flights
 from experiments.baselines.kernel_flights import RAPTOR_ROTORS, Rotors, State
 from experiments.bench import judges
-from qrl_envs.task import load
 
 # Front left, front right, back right, back left, as rotorpy numbers them.
 ROTORPY = Rotors(0.0304 * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]), np.array([1, -1, 1, -1]))
@@ -58,7 +57,7 @@ def test_a_lost_flight_is_no_success() -> None:
 
 def test_our_plant_hovers_under_the_thrusts_of_hover() -> None:
     """In the frames and units of a judge's rollouts."""
-    vehicle = load("hover", "crazyflie").vehicle
+    vehicle = judges.vehicle_of("crazyflie")
     given = judges.given_for(vehicle)
     count = 2
     still = kernel_flights.Start(np.eye(4)[:1].repeat(count, 0), *np.zeros((3, count, 3)))
