@@ -145,7 +145,7 @@ def manifest_of(kernel: Path | None) -> dict[str, Any] | None:
 
 def inputs(contestant: Contestant, kernel: Path | None, starts: int) -> dict[str, Any]:
     """What the flights depend on: hashes of code, vehicle, requirements and kernel."""
-    code = [BASELINES / contestant.script, BASELINES / "kernel_flights.py", Path(__file__), Path(plant.__file__)]
+    code = [BASELINES / contestant.script, Path(kernel_flights.__file__), Path(__file__), Path(plant.__file__)]
     shipped = load("hover", VEHICLES[contestant.words[0]]).model_dump_json()
     return {
         "starts": starts,

@@ -1,11 +1,16 @@
 """The judges' mappings: motor order, frames, starts, and what counts as a success. Their simulators are not here."""
 
+import json
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from experiments.baselines import kernel_flights
 from experiments.baselines.kernel_flights import RAPTOR_ROTORS, Rotors, State
 from experiments.bench import judges
+from experiments.bench.contestants import JUDGES, Contestant
 
 # Front left, front right, back right, back left, as rotorpy numbers them.
 ROTORPY = Rotors(0.0304 * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]), np.array([1, -1, 1, -1]))
@@ -79,3 +84,23 @@ def test_differences_of_plants_are_in_the_units_that_are_said() -> None:
 
     first, *_ = judges.differences("stage", after(np.radians(3.0), 0.002), after(0.0, 0.0))
     assert first[1:] == pytest.approx((0.01, 2.0, 2.0, 3.0, 0.002))
+
+
+def test_a_judge_is_asked_once_and_its_lines_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a judge that flies nothing, and that cannot roll its plant out."""
+    line = {"starts": "moderate", "flights": 3, "condition": "nominal", "controller": "qrl"}
+    line |= {"success": 1.0, "rmse_mm": 0.41, "settle_s": None, "lost": 0.0}
+    (tmp_path / "stub.txt").write_text("")
+    (tmp_path / "stub.py").write_text(
+        f"import sys\nassert '--given' not in sys.argv\nprint('BENCH ' + {json.dumps(line)!r})\n"
+        f"print(len(open({str(tmp_path / 'asked')!r}, 'a').write('x') * 'x'))\n"
+    )
+    monkeypatch.setattr(judges, "BASELINES", tmp_path)
+    monkeypatch.setattr(judges, "kernel_of", lambda vehicle, run, folder: None)
+    stub = Contestant("stub crazyflie", JUDGES, "stub.py", ("crazyflie",), "stub")
+    for _ in range(2):
+        judges.judge([stub], {"stub": Path(sys.executable)}, tmp_path / "out", 3, {}, fresh=False)
+    assert (tmp_path / "asked").read_text() == "x"
+    (kept,) = json.loads((tmp_path / "out" / "judges" / "judges.json").read_text())
+    assert (kept["flights"], kept["plants"], kept["outcome"]) == ([line], [], "done")
+    assert "| nominal | 0.4; 100 %; – |" in (tmp_path / "out" / "judges" / "judges.md").read_text()
