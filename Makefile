@@ -42,6 +42,7 @@ define HELP
        FAST=1                          with the figures of FAST=1; ARGS="--out FOLDER", --fresh
   make bench                         timings beside other libraries, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
+       ARGS="--only judges"            exported kernels in rotorpy and crazyflow, beside RAPTOR; --runs, --starts
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright

@@ -8,7 +8,9 @@ GROUPS = {
     "circle": "circle, until 99 % of 1,000 starts succeed",
     "commands": "complete commands with the shipped defaults, the final policy evaluated",
     "speed": "steps and samples a second",
+    "judges": "exported kernels in other people's simulators",
 }
+JUDGES = "judges"  # of this group a contestant is a vehicle of a judge, and is flown once, not timed
 
 
 class Contestant(NamedTuple):
@@ -45,6 +47,10 @@ CONTESTANTS = (
     Contestant("crazyflow", "speed", "crazyflow_physics.py", ("first_principles",), "crazyflow"),
     Contestant("crazyflow so_rpy", "speed", "crazyflow_physics.py", ("so_rpy",), "crazyflow"),
     Contestant("qrl command", "speed", "qrl_startup.py", ("hover",)),
+    Contestant("rotorpy crazyflie", JUDGES, "rotorpy_flights.py", ("crazyflie",), "rotorpy"),
+    Contestant("rotorpy hummingbird", JUDGES, "rotorpy_flights.py", ("hummingbird",), "rotorpy"),
+    Contestant("crazyflow cf21B_500", JUDGES, "crazyflow_flights.py", ("cf21B_500",), "crazyflow_judge"),
+    Contestant("crazyflow cf2x_L250", JUDGES, "crazyflow_flights.py", ("cf2x_L250",), "crazyflow_judge"),
 )
 
 

@@ -2,11 +2,12 @@
 
     .venv/bin/python -m experiments.bench.run [--out experiments/out/bench] [--only pendulum hover/qrl …] [--seeds 5]
                                           [--budget-seconds 150] [--fresh] [--list]
+                                          [--starts 10] [--runs crazyflie=runs/hover_crazyflie …]
 
 Seed by seed, all contestants of a seed before the next one, each run a process of its own. Finished runs are kept in
 OUT/runs (unless --fresh); an interrupted benchmark is resumed. Writes bench.json (every run), bench.md (tables) and
 bench.png (ratios). Each baseline has a virtual environment of its own; one that cannot be installed is reported and
-skipped.
+skipped. The group `judges` is no timing: `experiments.bench.judges`.
 """
 
 import argparse
@@ -14,18 +15,17 @@ import hashlib
 import json
 import os
 import platform
-import signal
-import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 from experiments.arguments import Parser, run_main
-from experiments.bench.contestants import CONTESTANTS, Contestant, chosen, key
+from experiments.bench.contestants import CONTESTANTS, JUDGES, Contestant, chosen, key
 from experiments.bench.install import NotInstalled, fingerprint, python_of
+from experiments.bench.judges import VEHICLES, judge
 from experiments.bench.plot import plot
+from experiments.bench.process import OUT_OF_TIME, run_with_timeout
 from experiments.bench.tables import Run, page
 from experiments.figures import runs as figure_runs
 from qrl.config import load_preset, preset_names
@@ -36,7 +36,6 @@ ROOT = Path(__file__).resolve().parents[2]
 BASELINES = ROOT / "experiments" / "baselines"
 GRACE_SECONDS = 120.0  # beyond a run's budget, for its checks
 MARK = "BENCH "  # prefix of a result line
-OUT_OF_TIME = "out of time"
 FINISHED = ("done", OUT_OF_TIME)
 
 
@@ -49,6 +48,14 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--seeds", type=int, default=5, metavar="N")
     parser.add_argument("--budget-seconds", type=float, default=150.0, help="time limit of one run", metavar="S")
+    parser.add_argument("--starts", type=int, default=10, help="flights a cell of the judges", metavar="N")
+    parser.add_argument(
+        "--runs",
+        nargs="+",
+        default=[],
+        metavar="VEHICLE=FOLDER",
+        help="hover policies for the judges, in place of training them",
+    )
     parser.add_argument("--fresh", action="store_true", help="repeat finished runs")
     parser.add_argument("--list", action="store_true", help="print the contestants and exit")
     args = parser.parse_args(argv)
@@ -58,6 +65,13 @@ def main(argv: list[str] | None = None) -> int:
     if args.seeds < 1 or not args.budget_seconds > 0:
         parser.error("expected --seeds of at least 1 and --budget-seconds above 0")
     parser.check_folder("--out", args.out)
+    args.runs = dict(word.split("=", 1) if "=" in word else (word, "") for word in args.runs)
+    for vehicle, run in args.runs.items():
+        if vehicle not in VEHICLES.values() or not (Path(run) / "config.json").exists():
+            known = ", ".join(VEHICLES.values())
+            parser.error(f"--runs: expected VEHICLE=FOLDER, a run folder of {known}, found '{vehicle}={run}'")
+    if args.starts < 1:
+        parser.error("expected --starts of at least 1")
     try:
         contestants = chosen(args.only)
     except ValueError as error:
@@ -75,8 +89,9 @@ def bench(contestants: list[Contestant], args: argparse.Namespace) -> None:
     folder = args.out / "runs"
     folder.mkdir(parents=True, exist_ok=True)
     pythons, absent = installed(contestants, BASELINES, args.environments)
-    for seed in range(args.seeds):
-        for contestant in contestants:
+    timed = [contestant for contestant in contestants if contestant.group != JUDGES]
+    for seed in range(args.seeds if timed else 0):
+        for contestant in timed:
             path = folder / f"{key(contestant).replace('/', '-')}-{seed}.json"
             if contestant.environment in pythons and (
                 args.fresh or not is_current(path, contestant, args.budget_seconds)
@@ -88,7 +103,11 @@ def bench(contestants: list[Contestant], args: argparse.Namespace) -> None:
                 files.replace_text(path, json.dumps(run, indent=1) + "\n")
         runs = [json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))]
         write_report(args.out, in_order(runs), absent)
-    print(f"{args.out}/bench.json, bench.md, bench.png")
+    if timed:
+        print(f"{args.out}/bench.json, bench.md, bench.png")
+    if judges := [contestant for contestant in contestants if contestant.group == JUDGES]:
+        runs = {vehicle: Path(run) for vehicle, run in args.runs.items()}
+        judge(judges, pythons, args.out, args.starts, runs, args.fresh)
 
 
 def installed(
@@ -166,24 +185,6 @@ def run_contestant(contestant: Contestant, python: Path, seed: int, budget_secon
     }
     origin["fingerprint"] = run_fingerprint(contestant)
     return {**identity, **origin, "outcome": outcome, "error": error, "lines": lines}
-
-
-def run_with_timeout(words: list[str], env: dict[str, str], seconds: float) -> tuple[str, str, str]:
-    """(standard output, standard error, how it ended) of a command in a temporary working directory."""
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        subprocess.Popen(words, env=env, cwd=folder, start_new_session=True, **pipes) as process,
-    ):
-        try:
-            out, err = process.communicate(timeout=seconds)
-            return out, err, "done" if process.returncode == 0 else f"exit code {process.returncode}"
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            return *process.communicate(), OUT_OF_TIME
-        except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
-            raise
 
 
 def print_run(run: Run) -> None:

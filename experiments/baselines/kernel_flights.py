@@ -1,0 +1,370 @@
+"""Flights of an exported kernel in other people's simulators, from the same starts as other controllers.
+
+NumPy and ctypes only: each judge's script imports it in an environment of its own. World: x forward, y left, z up.
+Body: x forward, y left, z up. All flights of a batch are flown side by side; n is their number, N that of rotors.
+"""
+
+import argparse
+import ctypes
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+PERIOD_S = 0.01  # of control: that of the kernels, and RAPTOR's
+DURATION_S, TAIL_S = 8.0, 2.0
+SUCCESS_M = 0.1  # distance from the point, throughout the tail
+LOST_M, LOST_RAD_S = 20.0, 200.0  # distance and body rate at which a flight is over
+STARTS_SEED = 20261128
+RAPTOR_MOST_M, RAPTOR_MOST_M_S = 0.5, 1.0  # to which PX4's mc_raptor clips the errors that RAPTOR is shown
+
+
+class State(NamedTuple):
+    """n rigid bodies; the position is relative to the point where they are to hover."""
+
+    rotation: Array  # [n, 3, 3] body -> world
+    position_m: Array  # [n, 3] world
+    velocity_m_s: Array  # [n, 3] world
+    body_rate_rad_s: Array  # [n, 3] body
+
+
+class Condition(NamedTuple):
+    """How a flight's vehicle differs from what its controllers were told."""
+
+    name: str
+    mass: float = 1.0  # factors
+    thrust: float = 1.0  # and the reaction torque, of every rotor
+    lag: float = 1.0
+    wind_m_s: float = 0.0  # along world x
+
+
+CONDITIONS = (
+    Condition("nominal"),
+    Condition("mass × 1.3", mass=1.3),
+    Condition("thrust × 0.85", thrust=0.85),
+    Condition("lag × 2", lag=2.0),
+    Condition("wind 2 m/s", wind_m_s=2.0),
+)
+
+
+class Rotors(NamedTuple):
+    """Where a vehicle's motors are, in the order of whoever numbered them."""
+
+    position_m: Array  # [N, 2] x, y from the center of mass
+    spin: Array  # [N] +1: the reaction torque is positive about body z
+
+
+class Simulator(Protocol):
+    """A judge: n vehicles under one condition."""
+
+    def start(self, states: State) -> None:
+        """Put the vehicles there, rotors at the speed at which the nominal vehicle hovers."""
+        ...
+
+    def states(self) -> State: ...
+
+    def step(self, set_points: Array, flying: NDArray[np.bool_]) -> None:
+        """One control period at these rotor speeds [n, N], in the judge's unit and order, of those that still fly."""
+        ...
+
+
+class Controller(Protocol):
+    """From states to set-points of the rotors' speeds [n, N], in the judge's unit and order."""
+
+    def reset(self, flights: int) -> None: ...
+
+    def act(self, states: State) -> Array: ...
+
+
+def motor_order(ours: Rotors, theirs: Rotors) -> NDArray[np.intp]:
+    """For each of their motors the index of ours that is in its place; [N]. ValueError if one has no match.
+
+    Matched by direction from the center of mass, and checked by spin: lengths of arms may differ by a rounding.
+    """
+    if len(ours.spin) != len(theirs.spin):
+        raise ValueError(f"{len(ours.spin)} motors of ours, {len(theirs.spin)} of theirs")
+    direction = [r.position_m / np.linalg.norm(r.position_m, axis=1, keepdims=True) for r in (theirs, ours)]
+    alike = direction[0] @ direction[1].T
+    order = np.argmax(alike, axis=1)
+    for i, j in enumerate(order):
+        if alike[i, j] < math.cos(math.radians(10.0)) or theirs.spin[i] != ours.spin[j]:
+            raise ValueError(f"motor {i + 1} at {theirs.position_m[i]} m, spin {theirs.spin[i]:+g}, is none of ours")
+    if len(set(order.tolist())) != len(order):
+        raise ValueError(f"two of their motors are one of ours: {order}")
+    return order
+
+
+def observations(states: State) -> NDArray[np.float32]:
+    """What a kernel is passed, [n, 18]: rotation row-major, position [m], velocity [m/s], body rates [rad/s]."""
+    rows = states.rotation.reshape(-1, 9)
+    return np.concatenate([rows, states.position_m, states.velocity_m_s, states.body_rate_rad_s], axis=1).astype(
+        np.float32
+    )
+
+
+class Kernel:
+    """An exported kernel (format 2) in a shared library, with a memory for each flight."""
+
+    def __init__(self, library: Path, manifest: Path) -> None:
+        said = json.loads(manifest.read_text(encoding="utf-8"))
+        if said["format"] != 2 or len(said["obs"]) != 18 or any(port["unit"] != "N" for port in said["act"]):
+            raise ValueError(f"{manifest}: expected a kernel of format 2 from 18 measurements to thrusts in newtons")
+        if said["control_period_s"] != PERIOD_S:
+            raise ValueError(f"{manifest}: expected a control period of {PERIOD_S} s")
+        self.rotors = Rotors(
+            np.array([port["position_m"][:2] for port in said["act"]]), np.array([port["spin"] for port in said["act"]])
+        )
+        loaded, name = ctypes.CDLL(str(library)), said["name"]
+        self._reset, self._step = getattr(loaded, f"{name}_reset"), getattr(loaded, f"{name}_step")
+        self._step.restype = ctypes.c_int
+        self._state_bytes = said["state_bytes"]
+        self._memories: list[Any] = []
+        if getattr(loaded, f"{name}_selftest")() != 0:
+            raise ValueError(f"{library}: its golden vectors are not reproduced")
+
+    def reset(self, flights: int) -> None:
+        # 8-byte words: aligned for whatever the state holds.
+        self._memories = [(ctypes.c_uint64 * (self._state_bytes // 8 + 1))() for _ in range(flights)]
+        for memory in self._memories:
+            self._reset(memory)
+
+    def thrusts_N(self, states: State) -> Array:
+        """[n, N], in the kernel's order."""
+        seen = np.ascontiguousarray(observations(states))
+        given = np.zeros((len(seen), len(self.rotors.spin)), np.float32)
+        numbers = ctypes.POINTER(ctypes.c_float)
+        for memory, row, out in zip(self._memories, seen, given, strict=True):
+            self._step(memory, row.ctypes.data_as(numbers), out.ctypes.data_as(numbers))
+        return given.astype(np.float64)
+
+
+class KernelController:
+    """A kernel whose thrusts become set-points by the vehicle's nominal thrust curve."""
+
+    def __init__(self, kernel: Kernel, theirs: Rotors, speed_of: Any) -> None:
+        """`speed_of`: thrust [N] -> rotor speed in the judge's unit, any shape."""
+        self._kernel, self._speed_of = kernel, speed_of
+        self._order = motor_order(kernel.rotors, theirs)
+
+    def reset(self, flights: int) -> None:
+        self._kernel.reset(flights)
+
+    def act(self, states: State) -> Array:
+        return self._speed_of(np.maximum(self._kernel.thrusts_N(states)[:, self._order], 0.0))
+
+
+# Front right, back right, back left, front left; spins as those of the Crazyflies that it was trained on.
+RAPTOR_ROTORS = Rotors(np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]]), np.array([-1, 1, -1, 1]))
+
+
+class RaptorController:
+    """RAPTOR (foundation-policy), which is told nothing but which speeds are the least and the greatest."""
+
+    def __init__(self, theirs: Rotors, least: float, most: float) -> None:
+        from foundation_policy import Raptor  # in the judge's environment
+
+        self._policy = Raptor()
+        self._order = motor_order(RAPTOR_ROTORS, theirs)
+        self._least, self._most = least, most
+        self._previous = np.zeros((0, 4))
+
+    def reset(self, flights: int) -> None:
+        self._policy.reset()
+        self._previous = np.zeros((flights, 4))
+
+    def act(self, states: State) -> Array:
+        seen = np.concatenate(
+            [
+                np.clip(states.position_m, -RAPTOR_MOST_M, RAPTOR_MOST_M),
+                states.rotation.reshape(-1, 9),
+                np.clip(states.velocity_m_s, -RAPTOR_MOST_M_S, RAPTOR_MOST_M_S),
+                states.body_rate_rad_s,
+                self._previous,
+            ],
+            axis=1,
+        )
+        self._previous = np.clip(self._policy.evaluate_step(seen), -1.0, 1.0)
+        return self._least + (self._most - self._least) * (self._previous[:, self._order] + 1.0) / 2.0
+
+
+def matrices(quaternions: Array) -> Array:
+    """Rotation matrices [n, 3, 3] of unit quaternions [n, 4], w first."""
+    w, x, y, z = quaternions.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), -1, 0)
+
+
+class Start(NamedTuple):
+    """n starts."""
+
+    quaternion: Array  # [n, 4] body -> world, w first
+    position_m: Array  # [n, 3] world, from the point
+    velocity_m_s: Array  # [n, 3] world
+    body_rate_rad_s: Array  # [n, 3] body
+
+    def states(self) -> State:
+        return State(matrices(self.quaternion), self.position_m, self.velocity_m_s, self.body_rate_rad_s)
+
+
+def moderate(count: int, seed: int = STARTS_SEED) -> Start:
+    """Within ±1 m, ±34° of yaw, pitch and roll each, ±0.5 m/s, ±1 rad/s."""
+    u = np.random.default_rng(seed).uniform(-1.0, 1.0, (4, count, 3))
+    (cr, cp, cy), (sr, sp, sy) = (f(math.radians(34.0) * u[0] / 2.0).T for f in (np.cos, np.sin))
+    quaternion = np.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ],
+        axis=1,
+    )
+    return Start(quaternion, u[1], 0.5 * u[2], u[3])
+
+
+def any_attitude(count: int, seed: int = STARTS_SEED) -> Start:
+    """The start ranges of qrl's evaluation of hover: any attitude, uniformly, ±2 m, ±1 m/s, ±1 rad/s."""
+    draws = np.random.default_rng(seed + 1)
+    quaternion = draws.normal(size=(count, 4))
+    u = draws.uniform(-1.0, 1.0, (3, count, 3))
+    return Start(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True), 2.0 * u[0], u[1], u[2])
+
+
+STARTS = {"moderate": moderate, "any attitude": any_attitude}
+
+
+def fly(simulator: Simulator, controller: Controller, starts: Start, duration_s: float = DURATION_S) -> Array:
+    """Distances from the point [n, steps] in meters after each period; infinite once lost."""
+    count = len(starts.quaternion)
+    simulator.start(starts.states())
+    controller.reset(count)
+    flying = np.ones(count, bool)
+    states, distances = starts.states(), []
+    with np.errstate(all="ignore"):  # a lost flight may overflow
+        for _ in range(round(duration_s / PERIOD_S)):
+            simulator.step(controller.act(_level_where_lost(states, flying)), flying)
+            states = simulator.states()
+            distance = np.linalg.norm(states.position_m, axis=1)
+            rate = np.linalg.norm(states.body_rate_rad_s, axis=1)
+            flying &= (distance < LOST_M) & (rate < LOST_RAD_S)  # a NaN is not less
+            distances.append(np.where(flying, distance, np.inf))
+    return np.array(distances).T
+
+
+def _level_where_lost(states: State, flying: NDArray[np.bool_]) -> State:
+    """`states` with those of lost flights replaced by a vehicle that hovers, so that controllers are passed numbers."""
+    still = State(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    return State(*(np.where(flying.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(states, still, strict=True)))
+
+
+def summary(distances: Array) -> dict[str, float]:
+    """Of flights [n, steps]: success, RMSE over the tail (median, [mm]) and time to settle (median, [s]).
+
+    Success: within SUCCESS_M throughout the tail. RMSE and settle are infinite for a flight that was lost or did not
+    settle, and enter the median so.
+    """
+    tail = distances[:, -round(TAIL_S / PERIOD_S) :]
+    outside = ~(distances < SUCCESS_M)
+    after = np.array([0.0 if not row.any() else (np.flatnonzero(row)[-1] + 1) * PERIOD_S for row in outside])
+    settle = np.where(outside[:, -1], np.inf, after)
+    return {
+        "success": float((tail < SUCCESS_M).all(axis=1).mean()),
+        "rmse_mm": 1e3 * _median(np.sqrt((tail**2).mean(axis=1))),
+        "settle_s": _median(settle),
+        "lost": float((~np.isfinite(distances[:, -1])).mean()),
+    }
+
+
+def tournament(
+    simulator: Callable[[Condition, str], Simulator], controllers: dict[str, Controller], starts: int
+) -> None:
+    """Report a line for each kind of starts, condition and controller; `simulator`: of a condition and a controller."""
+    from judge import report  # beside this file, where it is a script's; experiments.bench.judges needs no clock
+
+    for kind, draw in STARTS.items():
+        for condition in CONDITIONS:
+            for name, controller in controllers.items():
+                found = summary(fly(simulator(condition, name), controller, draw(starts)))
+                report({"starts": kind, "flights": starts, "condition": condition.name, "controller": name} | found)
+
+
+def _median(values: Array) -> float:
+    """Where the two in the middle are finite and infinite: infinite, not NaN."""
+    ordered = np.sort(values)
+    low, high = ordered[(len(ordered) - 1) // 2], ordered[len(ordered) // 2]
+    return float(low if low == high else (low + high) / 2.0)
+
+
+class Given(NamedTuple):
+    """Open-loop commands from starts, for our plant and a judge's: what `experiments.bench.judges` writes."""
+
+    starts: Start
+    thrusts_N: Array  # [n, steps, N]
+    rotors: Rotors  # ours, the order of the thrusts
+
+
+def read_given(path: Path) -> Given:
+    with np.load(path) as stored:
+        starts = Start(*(stored[name] for name in Start._fields))
+        return Given(starts, stored["thrusts_N"], Rotors(stored["rotor_position_m"], stored["rotor_spin"]))
+
+
+def rollout(simulator: Simulator, given: Given, theirs: Rotors, speed_of: Any) -> State:
+    """The states after each control period, each field [n, steps, …]; positions relative to the hover point."""
+    order = motor_order(given.rotors, theirs)
+    simulator.start(given.starts.states())
+    flying = np.ones(len(given.thrusts_N), bool)
+    states = []
+    for step in range(given.thrusts_N.shape[1]):
+        simulator.step(speed_of(given.thrusts_N[:, step, order]), flying)
+        states.append(simulator.states())
+    return State(*(np.stack(field, axis=1) for field in zip(*states, strict=True)))
+
+
+def write_rollouts(path: Path, found: dict[str, State]) -> None:
+    """Of each variant of a judge's plant, under "VARIANT/FIELD"."""
+    flat = {f"{variant}/{name}": array for variant, s in found.items() for name, array in s._asdict().items()}
+    np.savez(path, **flat)  # pyright: ignore[reportArgumentType]
+
+
+def read_rollouts(path: Path) -> dict[str, State]:
+    with np.load(path) as stored:
+        variants = dict.fromkeys(key.split("/")[0] for key in stored.files)
+        return {v: State(*(stored[f"{v}/{name}"] for name in State._fields)) for v in variants}
+
+
+class Job(NamedTuple):
+    """What a judge's script was asked for on its command line."""
+
+    vehicle: str
+    kernel: Kernel | None
+    starts: int
+    given: Path | None
+    rollouts: Path | None
+
+
+def job(vehicles: tuple[str, ...]) -> Job:
+    """Parse `SCRIPT VEHICLE [--kernel FOLDER] [--starts N] [--given FILE.npz --rollouts FILE.npz]`.
+
+    FOLDER holds kernel.so and manifest.json; without it the other controllers fly alone. --given: fly nothing, but
+    write to --rollouts where the judge's plant goes from its starts under its commands.
+    """
+    parser = argparse.ArgumentParser()
+    parser.add_argument("vehicle", choices=vehicles)
+    parser.add_argument("--kernel", type=Path)
+    parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--given", type=Path)
+    parser.add_argument("--rollouts", type=Path)
+    args = parser.parse_args()
+    kernel = Kernel(args.kernel / "kernel.so", args.kernel / "manifest.json") if args.kernel else None
+    return Job(args.vehicle, kernel, args.starts, args.given, args.rollouts)

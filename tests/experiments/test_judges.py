@@ -1,0 +1,106 @@
+"""The judges' mappings: motor order, frames, starts, and what counts as a success. Their simulators are not here."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.baselines import kernel_flights
+from experiments.baselines.kernel_flights import RAPTOR_ROTORS, Rotors, State
+from experiments.bench import judges
+from experiments.bench.contestants import JUDGES, Contestant
+
+# Front left, front right, back right, back left, as rotorpy numbers them.
+ROTORPY = Rotors(0.0304 * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]), np.array([1, -1, 1, -1]))
+
+
+def test_motors_are_matched_by_place_and_spin() -> None:
+    order = kernel_flights.motor_order(RAPTOR_ROTORS, ROTORPY)
+    np.testing.assert_array_equal(order, [3, 0, 1, 2])  # as rotorpy's own adapter of RAPTOR has it
+    thrusts = np.array([10.0, 20.0, 30.0, 40.0])  # front right, back right, back left, front left
+    np.testing.assert_array_equal(thrusts[order], [40.0, 10.0, 20.0, 30.0])
+    with pytest.raises(ValueError, match="spin -1, is none of ours"):
+        kernel_flights.motor_order(RAPTOR_ROTORS, ROTORPY._replace(spin=-ROTORPY.spin))
+    plus = ROTORPY._replace(position_m=np.array([[1.0, 0.0], [0.0, -1.0], [-1.0, 0.0], [0.0, 1.0]]))
+    with pytest.raises(ValueError, match="is none of ours"):
+        kernel_flights.motor_order(RAPTOR_ROTORS, plus)
+
+
+def test_the_observation_is_row_major_body_to_world() -> None:
+    quarter = np.array([[np.cos(np.pi / 4), 0.0, 0.0, np.sin(np.pi / 4)]])  # the nose to the left: body x is world y
+    rotation = kernel_flights.matrices(quarter)
+    np.testing.assert_allclose(rotation[0] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    numbers = np.arange(9.0).reshape(3, 1, 3)
+    seen = kernel_flights.observations(State(rotation, *numbers))
+    np.testing.assert_allclose(seen[0, :9], [0, -1, 0, 1, 0, 0, 0, 0, 1], atol=1e-7)
+    np.testing.assert_array_equal(seen[0, 9:], np.arange(9.0))
+
+
+def test_starts_are_those_that_are_said() -> None:
+    start = kernel_flights.moderate(400)
+    tilt = np.degrees(np.arccos(kernel_flights.matrices(start.quaternion)[:, 2, 2]))
+    assert 30.0 < tilt.max() < 48.0  # of roll and pitch of 34° together
+    assert np.abs(start.position_m).max() <= 1.0
+    upright = kernel_flights.matrices(kernel_flights.any_attitude(400).quaternion)[:, 2, 2]
+    assert upright.min() < -0.9
+    assert abs(upright.mean()) < 0.1
+
+
+def test_a_lost_flight_is_no_success() -> None:
+    near, far = np.full(800, 0.05), np.full(800, 0.05)
+    far[:100] = 1.0
+    lost, late = near.copy(), near.copy()
+    lost[300:] = np.inf
+    late[700] = 0.2
+    found = kernel_flights.summary(np.array([near, far, lost, late]))
+    assert (found["success"], found["lost"]) == (0.5, 0.25)
+    assert found["settle_s"] == pytest.approx((1.0 + 7.01) / 2)
+    assert kernel_flights.summary(np.full((1, 800), np.nan))["success"] == 0.0
+
+
+def test_our_plant_hovers_under_the_thrusts_of_hover() -> None:
+    """In the frames and units of a judge's rollouts."""
+    vehicle = judges.vehicle_of("crazyflie")
+    given = judges.given_for(vehicle)
+    count = 2
+    still = kernel_flights.Start(np.eye(4)[:1].repeat(count, 0), *np.zeros((3, count, 3)))
+    hover = np.broadcast_to(vehicle.hover_thrusts_N, (count, 5, 4))
+    there = judges.ours(vehicle, given._replace(starts=still, thrusts_N=hover), drag=True)
+    np.testing.assert_allclose(there.position_m, 0.0, atol=1e-5)
+    np.testing.assert_allclose(there.rotation, np.broadcast_to(np.eye(3), there.rotation.shape), atol=1e-5)
+    left = hover * np.array([1.0, 1.1, 1.1, 1.0])  # more on the right: rolls to the left, about −x
+    assert (
+        judges.ours(vehicle, given._replace(starts=still, thrusts_N=left), drag=True).body_rate_rad_s[0, -1, 0] < -0.1
+    )
+
+
+def test_differences_of_plants_are_in_the_units_that_are_said() -> None:
+    def after(angle_rad: float, moved: float) -> State:
+        turned = np.array([[np.cos(angle_rad / 2), 0.0, np.sin(angle_rad / 2), 0.0]])
+        rotation = np.broadcast_to(kernel_flights.matrices(turned), (2, 30, 3, 3))
+        return State(rotation, *(np.broadcast_to([moved, 0.0, 0.0], (2, 30, 3)) for _ in range(3)))
+
+    first, *_ = judges.differences("stage", after(np.radians(3.0), 0.002), after(0.0, 0.0))
+    assert first[1:] == pytest.approx((0.01, 2.0, 2.0, 3.0, 0.002))
+
+
+def test_a_judge_is_asked_once_and_its_lines_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a judge that flies nothing, and that cannot roll its plant out."""
+    line = {"starts": "moderate", "flights": 3, "condition": "nominal", "controller": "qrl"}
+    line |= {"success": 1.0, "rmse_mm": 0.41, "settle_s": None, "lost": 0.0}
+    (tmp_path / "stub.txt").write_text("")
+    (tmp_path / "stub.py").write_text(
+        f"import sys\nassert '--given' not in sys.argv\nprint('BENCH ' + {json.dumps(line)!r})\n"
+        f"print(len(open({str(tmp_path / 'asked')!r}, 'a').write('x') * 'x'))\n"
+    )
+    monkeypatch.setattr(judges, "BASELINES", tmp_path)
+    monkeypatch.setattr(judges, "kernel_of", lambda vehicle, run, folder: None)
+    stub = Contestant("stub crazyflie", JUDGES, "stub.py", ("crazyflie",), "stub")
+    for _ in range(2):
+        judges.judge([stub], {"stub": Path(sys.executable)}, tmp_path / "out", 3, {}, fresh=False)
+    assert (tmp_path / "asked").read_text() == "x"
+    (kept,) = json.loads((tmp_path / "out" / "judges" / "judges.json").read_text())
+    assert (kept["flights"], kept["plants"], kept["outcome"]) == ([line], [], "done")
+    assert "| nominal | 0.4; 100 %; – |" in (tmp_path / "out" / "judges" / "judges.md").read_text()
