@@ -165,6 +165,10 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
         longer = min(4, 2 ** max(0, round(np.log2(slower))))
         flights = max(values["apg_num_envs"] // longer, 8)
         values |= {"apg_episode_length": values["apg_episode_length"] * longer, "apg_num_envs": flights}
+        if not task.ideal:
+            vehicle = task.vehicle
+            each = vehicle.action_scale_N * len(vehicle.motors) / vehicle.mass_kg
+            values["apg_learning_rate"] *= min(1.0, PRESET_ACTION_M_S2 / each)
         if not task.ideal and values["observation_scale"]:
             values["observation_scale"] = [*values["observation_scale"], *_memory_scale(task)]
     reward = task.reward
@@ -176,6 +180,9 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
     return values
 
 
+# What a unit of action accelerates the vehicle by, up to which APG has its preset's step size: with the Hummingbird's 90 it
+# lost a policy that flew.
+PRESET_ACTION_M_S2 = 22.0
 INTEGRAL_SCALE_1_M_S = 6.0
 
 
