@@ -180,7 +180,7 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
     return values
 
 
-# What a unit of action accelerates the vehicle by, up to which APG has its preset's step size: with the Hummingbird's 90 it
+# What a unit of action accelerates a vehicle by, up to which APG has its preset's step size. At the Hummingbird's 90 it
 # lost a policy that flew.
 PRESET_ACTION_M_S2 = 22.0
 INTEGRAL_SCALE_1_M_S = 6.0
