@@ -142,7 +142,10 @@ class TaskEnv(abc.ABC):
         )
 
     def step_lanes(self, state: State, action: chex.Array) -> State:
-        """`step` of many lanes, which lie along the last axis of every leaf: so a CPU takes vectors of lanes."""
+        """`step` of many lanes, which lie along the last axis of every leaf: so a CPU takes vectors of lanes.
+
+        What a subclass computes (`_advance`, `_observe`, …) is for one lane, or for any axes behind those of one.
+        """
         return self.step(state, action)
 
     def symmetry(self, u: chex.Array) -> Symmetry:

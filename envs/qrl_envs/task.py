@@ -148,6 +148,8 @@ class QuadrotorTask(Spec):
                 raise ValueError(f"expected reward.{name} and evaluation.reward.{name} to be the same")
         if isinstance(train, CircleReward):
             self._check_circle(train)
+        elif self.policy_frame == "body":
+            raise ValueError("expected policy_frame 'world' to hover: in the body frame there is no heading to reach")
         for where, start in (("start", self.start), ("evaluation.start", self.evaluation.start)):
             reach = 3**0.5 * start.position_m
             if reach >= self.bounds.distance_m:

@@ -110,7 +110,7 @@ class Config(BaseModel):
 
     apg_fraction: Static[Fraction] = Field(
         description="last fraction of num_timesteps spent on the analytic policy gradient (APG), less where the policy"
-        " does not fly when it is to begin; 0: the paper's method alone"
+        " does not fly when it is to begin and apg_cotangent_norm is null; 0: the paper's method alone"
     )
     apg_num_envs: Static[Count] = Field(description="flights of one APG update")
     apg_episode_length: Static[Count] = Field(description="steps of one APG flight")

@@ -165,8 +165,7 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
         longer = min(4, 2 ** max(0, round(np.log2(slower))))
         flights = max(values["apg_num_envs"] // longer, 8)
         values |= {"apg_episode_length": values["apg_episode_length"] * longer, "apg_num_envs": flights}
-        if not task.ideal:
-            vehicle = task.vehicle
+        if not (vehicle := task.vehicle).ideal:
             each = vehicle.action_scale_N * len(vehicle.motors) / vehicle.mass_kg
             values["apg_learning_rate"] *= min(1.0, PRESET_ACTION_M_S2 / each)
         if not task.ideal and values["observation_scale"]:
@@ -182,7 +181,7 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
 
 # What a unit of action accelerates a vehicle by, up to which APG has its preset's step size. At the Hummingbird's 90 it
 # lost a policy that flew.
-PRESET_ACTION_M_S2 = 22.0
+PRESET_ACTION_M_S2 = 22.1
 INTEGRAL_SCALE_1_M_S = 6.0
 
 
@@ -242,6 +241,12 @@ def _check_frame(env: Env, learner: Config, where: str) -> None:
         raise BadInput(
             f"{where}: key 'observation_scale': expected 1 for the rotation matrix, and the same along x, y and z for"
             f" position and for velocity, for a task with policy_frame 'body'; found {list(scale[:15])}"
+        )
+    seen = getattr(env, "policy_observation_size", None) or 0
+    if seen > 18 and len({*scale[seen - 2 : seen]}) > 1:
+        raise BadInput(
+            f"{where}: key 'observation_scale': expected the same of the last two numbers that the policy sees, which"
+            f" are a vector, for a task with policy_frame 'body'; found {list(scale[seen - 2 : seen])}"
         )
 
 

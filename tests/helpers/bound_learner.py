@@ -1,7 +1,10 @@
 """The learner's pure functions with their spec and hyperparameters bound, as a test of one learner calls them."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
+
+import jax
 
 from qrl.algorithm import analytic_gradient, learner
 from qrl.algorithm.learner import LearnerSpec
@@ -16,9 +19,10 @@ class BoundLearner:
         action_size: int,
         axis: str | None = None,
         policy_observation_size: int | None = None,
+        policy_view: Callable[[jax.Array], jax.Array] = lambda observation: observation,
     ) -> None:
         self.config = config
-        self.spec = LearnerSpec(config, observation_size, action_size, axis, policy_observation_size)
+        self.spec = LearnerSpec(config, observation_size, action_size, axis, policy_observation_size, policy_view)
         self.planned_updates = config.planned_updates(config.learning_unrolls)
         self.policy, self.critic = self.spec.policy, self.spec.critic
         self._bind(config.hyperparameters)

@@ -23,7 +23,8 @@ class _Adapted:
         period = getattr(env, "dt", None)  # Brax's name
         self.control_period_s: float | None = None if period is None else float(period)
         for name in ("reset", "step", "observation_size", "action_size", *_ABILITIES):
-            if hasattr(env, name):
+            # A wrapper passes on what it does not have: the inner environment's `step_lanes` would be without its step.
+            if hasattr(type(env) if name == "step_lanes" else env, name):
                 setattr(self, name, getattr(env, name))
 
     params: Any = ()
@@ -68,5 +69,6 @@ def adapt(env: Env) -> TaskEnv:
         missing = next(name for name in halves if name not in found)
         expected = "expected both 'params' and 'with_params(params)', or neither"
         raise ValueError(f"{type(env).__name__}: {expected}; '{missing}' is missing")
-    task_env: Any = env if all(hasattr(env, name) for name in _ABILITIES) else _Adapted(env)
+    whole = all(hasattr(env, name) for name in _ABILITIES) and hasattr(type(env), "step_lanes")
+    task_env: Any = env if whole else _Adapted(env)
     return task_env

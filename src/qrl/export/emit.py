@@ -97,7 +97,7 @@ def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
 
 
 def _memory(policy: Policy, kernel: Kernel) -> dict[str, Any] | None:
-    """What the state holds: the previous action and the integral of the position, each null if it does not."""
+    """What the state holds: the previous action and the integral of the error, each null if it does not."""
     if policy.memory is None or kernel.memory is None:
         return None
     found: dict[str, Any] = {"previous_action": None, "integral": None}
@@ -339,6 +339,13 @@ def _golden_csv(policy: Policy, kernel: Kernel, golden: Vectors) -> str:
     acts = [f"{port.name}_lsb" for port in policy.actions]
     integral = kernel.memory.integral if kernel.memory else None
     kept = [f"integral_{names[i]}" for i in integral.position] if integral else []
+    if integral and integral.circle:
+        kept = [
+            "integral_distance",
+            f"integral_{names[integral.position[2]]}",
+            "integral_center_x",
+            "integral_center_y",
+        ]
     writer.writerow([*names, *(f"{name}_lsb" for name in names), "status", "status_i16", *acts, *kept])
     outputs = golden.outputs
     integrals = _integrals(golden, integral) if integral else np.zeros((len(golden.obs), 0))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 Ints = NDArray[np.int64]
 
 INT16 = 32767
-MOST_ERROR = 57344  # of a position on a circle, in steps
+MOST_ERROR = 57344  # of a position on a circle, in steps: above every E, and its product with an open gate is below 2³¹
 TANH_RANGE = 6.0  # the table covers [−6, 6], in 256 intervals; tanh(6) = 1 − 1.2e-5
 
 
@@ -46,7 +46,7 @@ class Integral:
 
     position: tuple[int, ...]  # indices into the observation
     inverse_radius: Ints  # [k] in [2¹⁴, 2¹⁵)
-    inverse_radius_shift: Ints  # [k] in [1, 30]
+    inverse_radius_shift: Ints  # [k] in [1, 29]
     gain: Ints  # [k] in [0, 2¹⁵)
     gain_shift: Ints  # [k] in [1, 30]
     limit: int  # below 2³⁰
@@ -130,7 +130,7 @@ class Kernel:
 
     @property
     def input_limits(self) -> tuple[Ints, Ints]:
-        """Smallest and largest of each of the network's inputs; [F + M]."""
+        """Smallest and largest of each of the network's inputs."""
         low, high = (shifted(limit, self.obs_shift) for limit in (self.obs_min, self.obs_max))
         if self.turn:
             full = np.full(6, INT16)
@@ -192,7 +192,7 @@ def _check_fields(kernel: Kernel) -> None:
         if integral := memory.integral:
             ranges += [
                 ("the integral's radius", integral.inverse_radius, 2**14, INT16),
-                ("the integral's radius", integral.inverse_radius_shift, 1, 30),
+                ("the integral's radius", integral.inverse_radius_shift, 1, 29),
                 ("the integral's gain", integral.gain, 0, INT16),
                 ("the integral's gain", integral.gain_shift, 1, 30),
                 ("the integral's limit", np.array(integral.limit), 1, 2**30 - 1),
@@ -245,7 +245,7 @@ def hidden(layer: Dense, activation: str, x: Ints) -> Ints:
 
 
 def network(kernel: Kernel, x: Ints) -> Ints:
-    """Actions [n, A], in steps of act_lsb, for inputs x [n, F + M]."""
+    """Actions [n, A], in steps of act_lsb, for the network's inputs x."""
     for layer in kernel.layers[:-1]:
         x = hidden(layer, kernel.activation, x)
     return np.clip(dense(kernel.layers[-1], x, -INT16 - 1), kernel.act_min, kernel.act_max)

@@ -103,15 +103,15 @@ WORLD_SIZE, BODY_SIZE = 18, 12  # numbers of a vehicle's measurements, and of th
 def in_body_frame(observation: NDArray[np.floating], horizontal: bool) -> NDArray[np.float64]:
     """The observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
     position [3], velocity [3], body rates [3]; then what follows them, of which the last two, with `horizontal`, are a
-    vector along the world's x and y, and three in the body frame. [n, 18 + M] -> [n, 12 + M or 13 + M].
+    vector along the world's x and y, and three in the body frame. [..., 18 + M] -> [..., 12 + M or 13 + M].
     """
     o = np.asarray(observation, np.float64)
-    rotation = o[:, :9].reshape(-1, 3, 3)
-    turned = [np.einsum("nij,ni->nj", rotation, o[:, at : at + 3]) for at in (9, 12)]
+    rotation = o[..., :9].reshape(*o.shape[:-1], 3, 3)
+    turned = [np.einsum("...ij,...i->...j", rotation, o[..., at : at + 3]) for at in (9, 12)]
     if not horizontal:
-        return np.concatenate([o[:, 6:9], *turned, o[:, 15:]], axis=-1)
-    vector = np.einsum("nij,ni->nj", rotation[:, :2], o[:, -2:])
-    return np.concatenate([o[:, 6:9], *turned, o[:, 15:-2], vector], axis=-1)
+        return np.concatenate([o[..., 6:9], *turned, o[..., 15:]], axis=-1)
+    vector = np.einsum("...ij,...i->...j", rotation[..., :2, :], o[..., -2:])
+    return np.concatenate([o[..., 6:9], *turned, o[..., 15:-2], vector], axis=-1)
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outputs], bias [outputs]
@@ -119,7 +119,7 @@ Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outpu
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """Deterministic policy in SI units: inputs [n, I] -> action [n, A].
+    """Deterministic policy in SI units: inputs [..., I] -> action [..., A].
 
     The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds [M]; I = F + M. With
     `body_frame` the network is given `in_body_frame` of them.
@@ -140,7 +140,7 @@ class Policy:
     body_frame: bool = False
 
     def __call__(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Action in SI units; [n, I] -> [n, A]. Of a policy without memory the inputs are the observation."""
+        """Action in SI units; [..., I] -> [..., A]. Of a policy without memory the inputs are the observation."""
         x = (inputs - self.observation_offset) * self.observation_gain
         x = np.clip(x, -self.observation_clip, self.observation_clip) * self.observation_scale
         x = self.seen(x)
@@ -156,7 +156,7 @@ class Policy:
         return self.body_frame and integral is not None and integral.circle_m is not None
 
     def seen(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
-        """What the network is given of inputs [n, I], scaled or not."""
+        """What the network is given of inputs [..., I], scaled or not."""
         return in_body_frame(inputs, self.turns_integral) if self.body_frame else np.asarray(inputs, np.float64)
 
     @property

@@ -75,12 +75,12 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     ranges = _ranges(inputs[:, :measured], policy.body_frame)
     seen = _ranges(x_float[:, :BODY_SIZE], same_axes=False) if policy.body_frame else ranges
     last = np.append(remembered, remembered[-1]) if policy.turns_integral else remembered
-    wanted = _steps(np.concatenate([seen, last]), layers[0][0], MIN_LEVELS)[: len(seen) + len(remembered)]
+    wanted = _steps(np.concatenate([seen, last]), layers[0][0], MIN_LEVELS)
+    if policy.turns_integral:
+        wanted = np.append(wanted[:-3], [wanted[-3:].min()] * 2)
     # What is integrated, remembered or turned has the finest step; a coarser one of the network's input is a shift.
     shift = np.floor(np.log2(wanted / (np.concatenate([seen, remembered]) / INT16)) + 1e-9).astype(np.int64)
     remembered_shift, seen_shift = shift[len(seen) :], shift[: len(seen)]
-    if policy.turns_integral:
-        remembered_shift[-2:] = remembered_shift[-2:].min()
     finest = ranges / INT16
     if policy.body_frame:
         steps = np.concatenate([finest[:15], wanted[9:12]])
@@ -222,7 +222,11 @@ def _integral(policy: Policy, lsb: Floats) -> tuple[integers.Integral, int]:
         raise UnsupportedNetwork(f"an integral within {limit:g} m s: expected a limit nearer to position and period")
     gain, gain_shift = _as_factor(2.0 * increment * 2.0**bits)
     inverse_radius, radius_shift = _as_factor(steps / radius * 2.0**15)
-    if radius_shift.min() < 1 or radius_shift.max() > 30:
+    if circle_m is not None and 1.5 * circle_m < radius:  # beyond two radii along an axis the error saturates
+        raise UnsupportedNetwork(
+            f"an integral within {radius:g} m of a circle of {circle_m:g} m: expected at most {1.5 * circle_m:g} m"
+        )
+    if radius_shift.min() < 1 or radius_shift.max() > 29:
         raise UnsupportedNetwork(f"an integral within {radius:g} m: expected a radius nearer to the range of positions")
     unit = limit / INT16 / 2.0**bits
     return (

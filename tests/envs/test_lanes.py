@@ -1,0 +1,60 @@
+"""`step_lanes`: many lanes along the last axis of every leaf."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from qrl.algorithm.analytic_gradient import _constant_leaves
+from qrl_envs import task
+from qrl_envs.env import RealQuadrotorEnv, from_task
+
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
+CASES = [("hover", None), ("circle", None), ("pendulum", None), ("hover", "hexa"), ("circle", "crazyflie")]
+
+
+@pytest.mark.parametrize(("name", "vehicle"), [*CASES, ("hover", "tilted")])
+def test_lanes_along_the_last_axis_step_as_each_by_itself(name: str, vehicle: str | None, tmp_path: Path) -> None:
+    """Values and gradients; "tilted": a full inertia, and motors along axes of their own."""
+    if vehicle == "tilted":
+        data = task.load("hover", "crazyflie").model_dump(mode="json")["vehicle"]
+        data["inertia_kg_m2"] = [*data["inertia_kg_m2"], 1e-7, 0.0, -1e-7]
+        data["motors"][0]["axis"] = [0.05, 0.0, 1.0]
+        vehicle = str(tmp_path / "tilted.json")
+        Path(vehicle).write_text(json.dumps(data))
+    world = from_task(task.load(name, vehicle))
+    states = jax.jit(jax.vmap(world.reset))(jax.random.split(jax.random.PRNGKey(0), 5))
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (5, world.action_size), minval=-1.2, maxval=1.2)
+
+    def last(tree: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), tree)
+
+    def each(actions: jax.Array) -> tuple[jax.Array, Any]:
+        after = jax.vmap(world.step)(states, actions)
+        return jnp.sum(after.reward) + jnp.sum(jnp.sin(after.obs)), last(after)
+
+    def lanes(actions: jax.Array) -> tuple[jax.Array, Any]:
+        after = world.step_lanes(last(states), actions.T)
+        return jnp.sum(after.reward) + jnp.sum(jnp.sin(after.obs)), after
+
+    (wanted, after_each), (found, after_lanes) = (jax.jit(jax.grad(f, has_aux=True))(actions) for f in (each, lanes))
+    assert jnp.abs(wanted).max() > 1e-4
+    np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5 * float(jnp.abs(wanted).max()))
+    for x, y in zip(jax.tree.leaves(after_lanes), jax.tree.leaves(after_each), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
+
+
+def test_parameters_and_a_flights_world_are_constant() -> None:
+    """So they stay out of APG's loop, and what moves does not."""
+    world = from_task(task.load("hover", "crazyflie"))
+    assert isinstance(world, RealQuadrotorEnv)
+    states = jax.vmap(world.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 3))
+    constant = _constant_leaves(world, states, jnp.zeros((4, 3))).pipeline_state
+    assert all(jax.tree.leaves(constant.params))
+    assert all(jax.tree.leaves(constant.x.world))
+    assert not any(jax.tree.leaves((constant.x.body, constant.x.speed, constant.x.integral_m_s)))
