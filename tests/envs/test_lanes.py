@@ -24,7 +24,9 @@ def test_lanes_along_the_last_axis_step_as_each_by_itself(name: str, vehicle: st
     if vehicle == "tilted":
         data = task.load("hover", "crazyflie").model_dump(mode="json")["vehicle"]
         data["inertia_kg_m2"] = [*data["inertia_kg_m2"], 1e-7, 0.0, -1e-7]
-        data["motors"][0]["axis"] = [0.05, 0.0, 1.0]
+        for motor in data["motors"]:
+            x, y = motor["position_m"][:2]
+            motor["axis"] = [1.5 * x, 1.5 * y, 1.0]
         vehicle = str(tmp_path / "tilted.json")
         Path(vehicle).write_text(json.dumps(data))
     world = from_task(task.load(name, vehicle))

@@ -6,6 +6,7 @@ without a manifest was interrupted while it was written, and is ignored.
 
 import errno
 import glob
+import logging
 import os
 import shutil
 import tempfile
@@ -25,6 +26,8 @@ from qrl.runs.files import Row, rank_key
 from qrl.runs.integrity import CorruptCheckpoint, IncompatibleCheckpoint, first_line
 from qrl.runs.record import RunConfig
 
+# Orbax's threads log what fails in them, with a traceback. A checkpoint that was not written raises here.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
 KEEP = 5  # most recent checkpoints; the best one is kept too
 STATE, RECORD = "state", "record"  # Orbax items
 # One process calls Orbax and must not wait for the other processes of the run.
