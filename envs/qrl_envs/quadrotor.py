@@ -163,13 +163,13 @@ def in_body_frame(observation: chex.Array, horizontal: bool = False) -> chex.Arr
     numbers = jnp.unstack(observation[..., :18], axis=-1)
     rows, rates = (numbers[0:3], numbers[3:6], numbers[6:9]), numbers[15:18]
 
-    def turned(vector: tuple[chex.Array, ...]) -> list[chex.Array]:
+    def rotated(vector: tuple[chex.Array, ...]) -> list[chex.Array]:
         return [
             sum(row[j] * x for row, x in zip(rows[1:], vector[1:], strict=True)) + rows[0][j] * vector[0]
             for j in range(3)
         ]
 
-    body = jnp.stack([*rows[2], *turned(numbers[9:12]), *turned(numbers[12:15]), *rates], axis=-1)
+    body = jnp.stack([*rows[2], *rotated(numbers[9:12]), *rotated(numbers[12:15]), *rates], axis=-1)
     if not horizontal:
         return jnp.concatenate([body, observation[..., 18:]], axis=-1)
     x, y = observation[..., -2], observation[..., -1]

@@ -163,7 +163,7 @@ def test_a_circle_of_a_real_vehicle_exports(tmp_path: Path) -> None:
     assert qrl("train", "circle", "--vehicle", "crazyflie", "--out", run, *TINY.split()) == 0
     loaded = TrainedRun.load(run)
     policy = loaded.float_policy()
-    assert policy.turns_integral
+    assert policy.rotates_integral
     env: Any = loaded.env
     seen = np.array(jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
     seen[:, 18:26] = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 8))

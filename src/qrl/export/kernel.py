@@ -123,8 +123,8 @@ class Kernel:
         return np.concatenate(parts) * 2.0**self.memory.shift
 
     @property
-    def turns_integral(self) -> bool:
-        """Whether the integral's last two components are a horizontal vector, which is turned into the body frame."""
+    def rotates_integral(self) -> bool:
+        """Whether the integral's last two components are a horizontal vector, which is rotated into the body frame."""
         integral = self.memory and self.memory.integral
         return self.turn is not None and integral is not None and integral.circle is not None
 
@@ -139,7 +139,7 @@ class Kernel:
         if self.memory is None:
             return low, high
         low, high = np.concatenate([low, self.memory.low]), np.concatenate([high, self.memory.high])
-        if self.turns_integral:
+        if self.rotates_integral:
             full = np.full(3, INT16)
             low, high = np.concatenate([low[:-2], -full]), np.concatenate([high[:-2], full])
         return low, high
@@ -297,10 +297,10 @@ def measured(kernel: Kernel, x: Ints) -> Ints:
         return shifted(x, kernel.obs_shift)
     rotation = x[:, :9].reshape(-1, 3, 3)
 
-    def turned(vector: Ints, shift: int) -> Ints:
+    def rotated(vector: Ints, shift: int) -> Ints:
         return np.clip(shifted((rotation * vector[:, :, None] >> 1).sum(axis=1), shift), -INT16, INT16)
 
-    position, velocity = turned(x[:, 9:12], turn.position), turned(x[:, 12:15], turn.velocity)
+    position, velocity = rotated(x[:, 9:12], turn.position), rotated(x[:, 12:15], turn.velocity)
     return np.concatenate([shifted(x[:, 6:9], turn.up), position, velocity, x[:, 15:]], axis=-1)
 
 
@@ -315,7 +315,7 @@ def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
 
 def remembered(kernel: Kernel, kept: Ints, x: Ints) -> Ints:
     """The network's last inputs, for those of the memory [n, M] and saturated observations x [n, F]."""
-    if not kernel.turns_integral:
+    if not kernel.rotates_integral:
         return kept
     rotation = x[:, :6].reshape(-1, 2, 3)
     vector = shifted((rotation * kept[:, -2:, None] >> 1).sum(axis=1), 15)

@@ -107,11 +107,11 @@ def in_body_frame(observation: NDArray[np.floating], horizontal: bool) -> NDArra
     """
     o = np.asarray(observation, np.float64)
     rotation = o[..., :9].reshape(*o.shape[:-1], 3, 3)
-    turned = [np.einsum("...ij,...i->...j", rotation, o[..., at : at + 3]) for at in (9, 12)]
+    rotated = [np.einsum("...ij,...i->...j", rotation, o[..., at : at + 3]) for at in (9, 12)]
     if not horizontal:
-        return np.concatenate([o[..., 6:9], *turned, o[..., 15:]], axis=-1)
+        return np.concatenate([o[..., 6:9], *rotated, o[..., 15:]], axis=-1)
     vector = np.einsum("...ij,...i->...j", rotation[..., :2, :], o[..., -2:])
-    return np.concatenate([o[..., 6:9], *turned, o[..., 15:-2], vector], axis=-1)
+    return np.concatenate([o[..., 6:9], *rotated, o[..., 15:-2], vector], axis=-1)
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outputs], bias [outputs]
@@ -150,20 +150,22 @@ class Policy:
         return self.to_si(x @ weight + bias)
 
     @property
-    def turns_integral(self) -> bool:
-        """Whether the integral's last two components are turned into the body frame."""
+    def rotates_integral(self) -> bool:
+        """Whether the integral's last two components are rotated into the body frame."""
         integral = self.memory and self.memory.integral
         return self.body_frame and integral is not None and integral.circle_m is not None
 
     def seen(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
         """What the network is given of inputs [..., I], scaled or not."""
-        return in_body_frame(inputs, self.turns_integral) if self.body_frame else np.asarray(inputs, np.float64)
+        return in_body_frame(inputs, self.rotates_integral) if self.body_frame else np.asarray(inputs, np.float64)
 
     @property
     def input_gain(self) -> NDArray[np.float64]:
         """The network's inputs over those in SI units; one for each row of its first layer."""
         gain = self.observation_gain * self.observation_scale
-        return np.concatenate([gain[6:], gain[-1:]] if self.turns_integral else [gain[6:]]) if self.body_frame else gain
+        return (
+            np.concatenate([gain[6:], gain[-1:]] if self.rotates_integral else [gain[6:]]) if self.body_frame else gain
+        )
 
     @property
     def memory_size(self) -> int:

@@ -74,11 +74,11 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     remembered = _memory_lsb(policy, act_lsb) * INT16
     ranges = _ranges(inputs[:, :measured], policy.body_frame)
     seen = _ranges(x_float[:, :BODY_SIZE], same_axes=False) if policy.body_frame else ranges
-    last = np.append(remembered, remembered[-1]) if policy.turns_integral else remembered
+    last = np.append(remembered, remembered[-1]) if policy.rotates_integral else remembered
     wanted = _steps(np.concatenate([seen, last]), layers[0][0], MIN_LEVELS)
-    if policy.turns_integral:
+    if policy.rotates_integral:
         wanted = np.append(wanted[:-3], [wanted[-3:].min()] * 2)
-    # What is integrated, remembered or turned has the finest step; a coarser one of the network's input is a shift.
+    # What is integrated, remembered or rotated has the finest step; a coarser one of the network's input is a shift.
     shift = np.floor(np.log2(wanted / (np.concatenate([seen, remembered]) / INT16)) + 1e-9).astype(np.int64)
     remembered_shift, seen_shift = shift[len(seen) :], shift[: len(seen)]
     finest = ranges / INT16
@@ -96,7 +96,7 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     if policy.body_frame:
         turn, first_step = _turn(lsb, wanted)
     last_step = remembered / INT16 * 2.0**remembered_shift
-    if policy.turns_integral:
+    if policy.rotates_integral:
         last_step = np.concatenate([last_step[:-2], np.full(3, 2.0**16 * lsb[0] * last_step[-1])])
     step = np.concatenate([first_step, last_step])
     kernel = Kernel(
@@ -260,7 +260,7 @@ def _check(policy: Policy) -> None:
         raise UnsupportedNetwork("a memory that holds nothing")
     expected = len(policy.observations) + policy.memory_size
     if policy.body_frame:
-        expected += BODY_SIZE - WORLD_SIZE + policy.turns_integral
+        expected += BODY_SIZE - WORLD_SIZE + policy.rotates_integral
         if len(policy.observations) != WORLD_SIZE or np.any(policy.observation_offset[:WORLD_SIZE]):
             raise UnsupportedNetwork("the body frame: expected a vehicle's 18 observations, not standardized")
     if len(policy.layers[0][0]) != expected:
@@ -276,7 +276,7 @@ def si_layers(policy: Policy) -> list[Layer]:
     weight = weight * policy.input_gain[:, None]
     offset = policy.observation_offset
     if policy.body_frame:
-        offset = np.append(offset[WORLD_SIZE - BODY_SIZE :], [0.0] * policy.turns_integral)
+        offset = np.append(offset[WORLD_SIZE - BODY_SIZE :], [0.0] * policy.rotates_integral)
     layers[0] = weight, bias - offset @ weight
     weight, bias = layers[-1]
     layers[-1] = weight * policy.scale, bias * policy.scale + policy.offset

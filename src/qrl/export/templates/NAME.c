@@ -403,7 +403,7 @@ static void integrate(int32_t integral[INTEGRAL], union activations *x) {
 #if TURN
 
 /* A vector of the world in the body frame. */
-static void turned(activation y[3], const int32_t r[9], const activation v[], int numbers, int shift) {
+static void rotated(activation y[3], const int32_t r[9], const activation v[], int numbers, int shift) {
     for (int j = 0; j < 3; ++j) {
         int32_t sum = 0;
         for (int i = 0; i < numbers; ++i) {
@@ -421,8 +421,8 @@ static void turn(union activations *x, int32_t r[9]) {
     for (int i = 0; i < 3; ++i) {
         x->one[i] = (activation)(shifted(r[6 + i], UP_SHIFT) + OFFSET);
     }
-    turned(x->one + 3, r, x->one + 9, 3, POSITION_SHIFT);
-    turned(x->one + 6, r, x->one + 12, 3, VELOCITY_SHIFT);
+    rotated(x->one + 3, r, x->one + 9, 3, POSITION_SHIFT);
+    rotated(x->one + 6, r, x->one + 12, 3, VELOCITY_SHIFT);
     for (int i = 9; i < 12; ++i) {
         x->one[i] = x->one[i + 6];
     }
@@ -454,7 +454,7 @@ static void complete(union activations *x, @name@_state *state) {
     }
 #if TURN && defined(CIRCLE) /* the last two are a horizontal vector */
     const activation horizontal[2] = {x->one[i - 2], x->one[i - 1]};
-    turned(x->one + i - 2, r, horizontal, 2, 15);
+    rotated(x->one + i - 2, r, horizontal, 2, 15);
     ++i;
 #endif
 #else
