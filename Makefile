@@ -73,19 +73,19 @@ $(call need,view,$(RUN),RUN is missing: make view RUN=runs/circle)
 
 train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
-		$(call flag,--vehicle,$(VEHICLE)) $(call flag,--uncertainty,$(UNCERTAINTY)) $(call flag,--out,$(OUT)) \
-		$(if $(filter-out 0,$(RESUME)),--resume) \
+		$(call flag,--vehicle,$(VEHICLE)) $(call flag,--uncertainty,$(UNCERTAINTY)) \
+		$(call flag,--reference,$(REFERENCE)) $(call flag,--out,$(OUT)) $(if $(filter-out 0,$(RESUME)),--resume) \
 		$(call flag,--config,$(CONFIG)) $(ARGS)
 
 evaluate: $(STAMP)
-	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(ARGS)
+	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) $(ARGS)
 
 # `export` is a directive of make itself where a line begins with it.
 $(or export): $(STAMP)
 	@exec $(QRL) export $(call quoted,$(RUN)) $(call flag,--name,$(NAME)) $(ARGS)
 
 view: $(STAMP)
-	@exec $(QRL) view $(call quoted,$(RUN)) $(ARGS)
+	@exec $(QRL) view $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) $(ARGS)
 
 sweep: $(STAMP)
 	@exec $(QRL) sweep $(call quoted,$(GRID)) $(call flag,--out,$(OUT)) $(ARGS)

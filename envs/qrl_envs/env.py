@@ -20,7 +20,9 @@ from flax import struct
 
 from qrl_envs import measures, pendulum, plant, quadrotor, rewards, symmetry
 from qrl_envs import task as tasks
+from qrl_envs.reference import Random, Reference
 from qrl_envs.symmetry import Symmetry
+from qrl_envs.target import Figure, Motion, Target
 from qrl_envs.task import PendulumTask, QuadrotorTask, Task
 from qrl_envs.uncertainty import Uncertainty
 
@@ -246,22 +248,19 @@ class QuadrotorEnv(TaskEnv):
         env = self.with_params(self.params._replace(start=start, reward=reward))
 
         def measure(observations: chex.Array) -> dict[str, chex.Array]:
-            if spec.reward.form == "hover":
-                flight = measures.hover(observations, spec)
-            else:
-                flight = measures.circle(observations, spec, spec.reward.radius_m, spec.reward.speed_m_s)
+            flight = measures.of_vehicle(observations, self.task)
             return measures.summarize(flight, round(spec.tail_s / dt_s), dt_s)
 
         return Evaluation(env, round(spec.duration_s / dt_s), round(spec.return_s / dt_s), measure)
 
 
 class RealQuadrotorEnv(QuadrotorEnv):
-    """Hover or circle with a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
+    """A task of a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
 
-    Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, then its
-    memory, as the task has it: previous action [N], integral of the position error [3], on a circle [4];
-    then what only a critic may see (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as
-    in `QuadrotorEnv`.
+    Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, relative
+    to the reference now if the task has one; the preview of it, [3] for each time ahead; then its memory, as the task
+    has it: previous action [N], integral of the position error [3], on a circle [4]; then what only a critic may see
+    (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as in `QuadrotorEnv`.
     """
 
     def __init__(
@@ -271,11 +270,24 @@ class RealQuadrotorEnv(QuadrotorEnv):
         uncertainty = uncertainty or task.uncertainty or Uncertainty()
         self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
         self._integrator = plant.integrator(task)
+        self._reference = self._followed(task.reference, task.episode_s, anywhere=True)
         motors, integrals = len(task.vehicle.motors), self._integrator.size if self._integrator else 0
-        self.policy_observation_size = 18 + task.memory.previous_action * motors + integrals
+        ahead = 3 * len(task.preview_s)
+        self.policy_observation_size = 18 + ahead + task.memory.previous_action * motors + integrals
         self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
         latency_s = uncertainty.latency_s[1] if most_latency_s is None else most_latency_s
         self._steps_late = plant.delayed_steps(latency_s, task.control_period_s)
+
+    def _followed(self, spec: Reference | None, flight_s: float, anywhere: bool) -> Figure | Motion | None:
+        """The reference that `spec` describes; of a figure that repeats, flights may begin anywhere."""
+        if spec is None:
+            return None
+        if isinstance(spec, Random):
+            return Motion(spec, self.task.control_period_s, self.task.preview_s)
+        return Figure(spec, self.task.control_period_s, flight_s, self.task.preview_s, anywhere)
+
+    def _target(self, world: plant.World, steps: chex.Array) -> Target | None:
+        return self._reference.at(world.reference, steps) if self._reference else None
 
     def step(self, state: State, action: chex.Array) -> State:
         return self._with_truth(super().step(state, action))
@@ -284,45 +296,68 @@ class RealQuadrotorEnv(QuadrotorEnv):
         return self._with_truth(super()._reset(params, rng))
 
     def _with_truth(self, state: State) -> State:
-        return state.replace(info={**state.info, "true_obs": quadrotor.observe(state.pipeline_state.x.body)})
+        return state.replace(info={**state.info, "true_obs": quadrotor.observe(self._error(state.pipeline_state.x))})
+
+    def _error(self, x: plant.Flight) -> quadrotor.Body:
+        """The body as it is, relative to the reference."""
+        target = self._target(x.world, x.steps)
+        return x.body if target is None else plant.relative(x.body, target)
+
+    @property
+    def body_view(self) -> quadrotor.BodyView | None:
+        """What the policy is given in the body frame; None if it is given the world's."""
+        if self.task.policy_frame == "world":
+            return None
+        on_circle = self.task.reward.form == "circle"
+        last = 0 if self._integrator is None else 2 if on_circle else 3
+        return quadrotor.BodyView(heading=not on_circle, vectors=len(self.task.preview_s), last=last)
 
     def policy_view(self, observation: chex.Array) -> chex.Array:
-        if self.task.policy_frame == "world":
-            return observation
-        on_circle = self._integrator is not None and self._integrator.circle_m is not None
-        return quadrotor.in_body_frame(observation, horizontal=on_circle)
+        view = self.body_view
+        return observation if view is None else quadrotor.in_body_frame(observation, view)
 
     def _start(self, params: Any, key: chex.PRNGKey) -> quadrotor.Body:
         return quadrotor.draw(params.start, key)
 
     def _draw(self, params: Any, rng: chex.PRNGKey) -> plant.Flight:
         # The start's key is that of the ideal world: the same starts, whatever the plant.
-        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (plant.DRAWS + self.action_size,))
-        return plant.begin(
-            self._start(params, rng),
-            plant.draw(params.ranges, params.physics, u),
-            self._steps_late,
-            self._integrator,
-            self.task.control_period_s,
-        )
+        draws, others = plant.DRAWS + self.action_size, self._reference.draws if self._reference else 0
+        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (draws + others,))
+        world, body, origin_m = plant.draw(params.ranges, params.physics, u[:draws]), self._start(params, rng), 0.0
+        if self._reference:
+            thrust = jnp.sum(world.motor_factor * world.physics.motor_max_N)
+            world = world._replace(reference=self._reference.draw(u[draws:], world.physics, thrust))
+            target = self._reference.at(world.reference, jnp.int32(0))
+            origin_m = target.position_m
+            body = plant.relative(body, jax.tree.map(jnp.negative, target))
+        return plant.begin(body, world, self._steps_late, self._integrator, self.task.control_period_s, origin_m)
 
     def _advance(self, params: Params, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
-        world = x.world
+        world, before = x.world, x.previous_action
         x = x._replace(world=jax.lax.stop_gradient(world))
-        flight = plant.step(x, action, self._integrator, self.task.control_period_s)._replace(world=world)
-        return flight, params.reward(flight.body, flight.previous_action)
+        target = self._target(x.world, x.steps + 1)
+        origin_m = 0.0 if target is None else target.position_m
+        flight = plant.step(x, action, self._integrator, self.task.control_period_s, origin_m)._replace(world=world)
+        body = flight.body if target is None else plant.relative(flight.body, target)
+        return flight, params.reward(body, flight.previous_action, before)
 
     def _observe(self, params: Params, x: plant.Flight) -> chex.Array:
-        seen = plant.observe(x, self.task.memory.previous_action)
+        seen = plant.observe(x, self.task.memory.previous_action, self._target(x.world, x.steps))
         return jnp.concatenate([seen, plant.privileged(x, params.physics, self.task.control_period_s)])
 
     def _out_of_bounds(self, params: Params, x: plant.Flight) -> chex.Array:
-        return super()._out_of_bounds(params, x.body)
+        return super()._out_of_bounds(params, self._error(x))
+
+    def evaluation(self) -> Evaluation:
+        plan, spec = super().evaluation(), self.task.evaluation
+        if isinstance(env := plan.env, RealQuadrotorEnv):
+            env._reference = self._followed(spec.reference, spec.duration_s, anywhere=False)
+        return plan
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         plain = super().symmetry(u)
         world, body = plain.observation[9:12, 9:12], plain.observation[15:18, 15:18]
-        parts = [plain.observation]
+        parts = [plain.observation, *[world] * len(self.task.preview_s)]
         if self.task.memory.previous_action:
             parts.append(plain.action)
         if self._integrator:

@@ -11,6 +11,7 @@ class ObservationPort(NamedTuple):
     name: str
     unit: str  # SI; "1": dimensionless
     frame: str
+    ahead_s: float | None = None  # of the preview of a reference: how far ahead
 
 
 class ActionPort(NamedTuple):
@@ -37,7 +38,10 @@ def observations(task: Task) -> list[ObservationPort]:
             ObservationPort("sin_theta", "1", angle),
             ObservationPort("theta_dot", "rad/s", angle),
         ]
-    origin = "the hover point" if task.reward.form == "hover" else "the circle's center"
+    origin = {"hover": "the hover point", "circle": "the circle's center", "track": "the reference now"}[
+        task.reward.form
+    ]
+    relative = " relative to that of the reference now" if task.reference else ""
     rotation = [
         ObservationPort(f"r{i}{j}", "1", f"rotation matrix body -> world: world {axis} part of the body {other} axis")
         for i, axis in enumerate("xyz", 1)
@@ -46,8 +50,18 @@ def observations(task: Task) -> list[ObservationPort]:
     return [
         *rotation,
         *(ObservationPort(f"p{axis}", "m", f"world: position from {origin}") for axis in "xyz"),
-        *(ObservationPort(f"v{axis}", "m/s", "world: velocity") for axis in "xyz"),
+        *(ObservationPort(f"v{axis}", "m/s", f"world: velocity{relative}") for axis in "xyz"),
         *(ObservationPort(f"w{axis}", "rad/s", "body: angular rate") for axis in "xyz"),
+        *(
+            ObservationPort(
+                f"d{i}{axis}",
+                "m/s",
+                f"world: the reference's velocity in {ahead_s:g} s minus its velocity now",
+                ahead_s=ahead_s,
+            )
+            for i, ahead_s in enumerate(task.preview_s, 1)
+            for axis in "xyz"
+        ),
     ]
 
 

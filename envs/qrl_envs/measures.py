@@ -21,12 +21,18 @@ class Errors(NamedTuple):
     finite: chex.Array  # [] bool: all observations are finite
     within: chex.Array  # [K + 1] bool
     errors: dict[str, chex.Array]  # name with unit -> [K + 1]
+    most_rms_m: float | None = None  # success is the root mean square of position_m below this; None: all are `within`
 
 
 def hover(observations: chex.Array, tolerance: FlightEvaluation) -> Errors:
     """Distance from the hover point [m]."""
     distance = jnp.linalg.norm(observations[:, 9:12], axis=-1)
     return Errors(_finite(observations), distance < tolerance.distance_m, {"position_m": distance})
+
+
+def track(observations: chex.Array, tolerance: FlightEvaluation) -> Errors:
+    """Distance from the reference [m], to which the observed positions are relative."""
+    return hover(observations, tolerance)._replace(most_rms_m=tolerance.distance_m)
 
 
 def circle(observations: chex.Array, tolerance: FlightEvaluation, radius_m: float, speed_m_s: float) -> Errors:
@@ -46,6 +52,14 @@ def pendulum(observations: chex.Array, tolerance: PendulumEvaluation) -> Errors:
     return Errors(_finite(observations), within, {"angle_rad": theta})
 
 
+def of_vehicle(observations: chex.Array, task: QuadrotorTask) -> Errors:
+    """The errors of a quadrotor's task."""
+    spec = task.evaluation
+    if isinstance(reward := spec.reward, CircleReward):
+        return circle(observations, spec, reward.radius_m, reward.speed_m_s)
+    return (track if reward.form == "track" else hover)(observations, spec)
+
+
 def _finite(observations: chex.Array) -> chex.Array:
     return jnp.all(jnp.isfinite(observations))
 
@@ -62,8 +76,12 @@ def summarize(flight: Errors, tail_steps: int, dt_s: float) -> dict[str, chex.Ar
     """{"success": 0 or 1, "settle_s", "rms_<error>"…} of one flight; its tail is the last `tail_steps` periods."""
     tail = {name: error[-(tail_steps + 1) :] for name, error in flight.errors.items()}
     rms = {f"rms_{name}": jnp.sqrt(jnp.mean(error**2)) for name, error in tail.items()}
+    if flight.most_rms_m is None:
+        good = jnp.all(flight.within[-(tail_steps + 1) :])
+    else:
+        good = rms["rms_position_m"] < flight.most_rms_m
     return {
-        "success": (flight.finite & jnp.all(flight.within[-(tail_steps + 1) :])).astype(jnp.float32),
+        "success": (flight.finite & good).astype(jnp.float32),
         "settle_s": jnp.where(flight.finite, settle_s(flight.within, dt_s), jnp.inf),
         **{name: jnp.where(jnp.isfinite(value), value, jnp.inf) for name, value in rms.items()},
     }
@@ -88,12 +106,7 @@ def _of_flights(task: Task, observations: jax.Array) -> tuple[dict[str, jax.Arra
     dt_s = task.control_period_s
 
     def one(flight: jax.Array) -> tuple[dict[str, jax.Array], dict[str, jax.Array]]:
-        if isinstance(task, PendulumTask):
-            errors = pendulum(flight, task.evaluation)
-        elif isinstance(reward := task.evaluation.reward, CircleReward):
-            errors = circle(flight, task.evaluation, reward.radius_m, reward.speed_m_s)
-        else:
-            errors = hover(flight, task.evaluation)
+        errors = pendulum(flight, task.evaluation) if isinstance(task, PendulumTask) else of_vehicle(flight, task)
         return errors.errors, summarize(errors, round(task.evaluation.tail_s / dt_s), dt_s)
 
     return jax.vmap(one)(observations)

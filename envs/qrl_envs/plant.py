@@ -14,6 +14,7 @@ import numpy as np
 from qrl_envs import integrate, quadrotor, rotation, rotors
 from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
 from qrl_envs.rotors import Rotors
+from qrl_envs.target import Target
 from qrl_envs.task import CircleReward, QuadrotorTask
 from qrl_envs.uncertainty import Uncertainty
 from qrl_envs.vehicle import Vehicle
@@ -68,6 +69,7 @@ class World(NamedTuple):
     position_bias_m: chex.Array  # [3] world
     noise_row: chex.Array  # [] in [0, 1): where this flight begins in the table of noise
     noise_stride: chex.Array  # [] in [0, 1)
+    reference: Any = ()  # this flight's, of a task that tracks one (`target`)
 
 
 DRAWS = 23  # uniform numbers of a draw, besides one for each motor
@@ -176,8 +178,17 @@ def delayed_steps(latency_s: float, dt_s: float) -> int:
     return int(np.ceil(latency_s / dt_s - 1e-6)) + 1
 
 
-def begin(body: Body, world: World, steps_late: int, integrator: Integrator | None, dt_s: float) -> Flight:
-    """A flight's state at its start: rotors at the speed of hover, a previous action of 0."""
+def begin(
+    body: Body,
+    world: World,
+    steps_late: int,
+    integrator: Integrator | None,
+    dt_s: float,
+    origin_m: chex.Array | float = 0.0,
+) -> Flight:
+    """A flight's state at its start: rotors at the speed of hover, a previous action of 0. The position's error is
+    relative to `origin_m` [3].
+    """
     physics = world.physics
     hover = rotors.speed_of(world.rotors.curve, physics.hover_thrust_N / physics.motor_max_N)
     motors = hover.shape[0]
@@ -190,14 +201,20 @@ def begin(body: Body, world: World, steps_late: int, integrator: Integrator | No
         sensed=sensed,
         previous_action=jnp.zeros(motors),
         integral_m_s=integrated(
-            jnp.zeros(integrator.size if integrator else 0), sensed.pose.position_m, integrator, dt_s
+            jnp.zeros(integrator.size if integrator else 0), sensed.pose.position_m - origin_m, integrator, dt_s
         ),
         steps=jnp.int32(0),
     )
 
 
-def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s: float) -> Flight:
-    """One control period under `action` [N]."""
+def step(
+    flight: Flight,
+    action: chex.Array,
+    integrator: Integrator | None,
+    dt_s: float,
+    origin_m: chex.Array | float = 0.0,
+) -> Flight:
+    """One control period under `action` [N], after which the position's error is relative to `origin_m` [3]."""
     world, physics = flight.world, flight.world.physics
     thrust = quadrotor.thrust_N(physics, action)
     set_point = rotors.speed_of(world.rotors.curve, thrust / physics.motor_max_N)
@@ -237,7 +254,7 @@ def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s
         world=world,
         sensed=sensed,
         previous_action=quadrotor.applied_action(physics, thrust),
-        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m, integrator, dt_s),
+        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m - origin_m, integrator, dt_s),
         steps=steps,
     )
 
@@ -294,10 +311,20 @@ def sense(world: World, body: Body, steps: chex.Array) -> Body:
     )
 
 
-def observe(flight: Flight, previous_action: bool) -> chex.Array:
-    """What a policy observes: the measured body [18], then its memory: previous action [N], integral [k]."""
+def observe(flight: Flight, previous_action: bool, target: Target | None = None) -> chex.Array:
+    """What a policy observes: the measured body [18], relative to the target if there is one, then the target's preview
+    [3k], then its memory: previous action [N], integral [k].
+    """
     memory = [flight.previous_action, flight.integral_m_s][0 if previous_action else 1 :]
-    return jnp.concatenate([quadrotor.observe(flight.sensed), *memory])
+    if target is None:
+        return jnp.concatenate([quadrotor.observe(flight.sensed), *memory])
+    return jnp.concatenate([quadrotor.observe(relative(flight.sensed, target)), target.preview_m_s, *memory])
+
+
+def relative(body: Body, target: Target) -> Body:
+    """`body` with position and velocity relative to a target."""
+    (position, attitude), (velocity, rate) = body
+    return Body(Pose(position - target.position_m, attitude), Twist(velocity - target.velocity_m_s, rate))
 
 
 def _inertia(physics: Physics) -> chex.Array:

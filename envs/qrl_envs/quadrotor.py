@@ -155,26 +155,33 @@ def observe(body: Body) -> chex.Array:
     return jnp.concatenate([*jnp.unstack(rotation.matrix(body.pose.attitude)), body.pose.position_m, *body.twist])
 
 
-def in_body_frame(observation: chex.Array, horizontal: bool = False) -> chex.Array:
-    """An observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
-    position [3], velocity [3], body rates [3]; then what follows them, of which the last two, with `horizontal`, are a
-    vector along the world's x and y, and three in the body frame. [..., 18 + M] -> [..., 12 + M or 13 + M].
-    """
-    numbers = jnp.unstack(observation[..., :18], axis=-1)
-    rows, rates = (numbers[0:3], numbers[3:6], numbers[6:9]), numbers[15:18]
+class BodyView(NamedTuple):
+    """What a policy is given in the body frame."""
 
-    def rotated(vector: tuple[chex.Array, ...]) -> list[chex.Array]:
+    heading: bool  # the world's x axis, too
+    vectors: int  # vectors of the world that follow the 18 numbers
+    last: int  # numbers at the end that are a vector of the world, too: x, y, z, or x and y of one that is horizontal
+
+
+def in_body_frame(observation: chex.Array, view: BodyView) -> chex.Array:
+    """An observation as it is in the body frame: the world's x axis [3], if `heading`, and its z axis [3], position
+    [3], velocity [3], body rates [3], the vectors that follow; what is neither; the vector at the end [3].
+    """
+    numbers = jnp.unstack(observation, axis=-1)
+    rows = numbers[0:3], numbers[3:6], numbers[6:9]
+
+    def rotated(vector: list[chex.Array]) -> list[chex.Array]:
         return [
-            sum(row[j] * x for row, x in zip(rows[1:], vector[1:], strict=True)) + rows[0][j] * vector[0]
+            sum(row[j] * x for row, x in zip(rows[1:], vector[1:], strict=False)) + rows[0][j] * vector[0]
             for j in range(3)
         ]
 
-    body = jnp.stack([*rows[2], *rotated(numbers[9:12]), *rotated(numbers[12:15]), *rates], axis=-1)
-    if not horizontal:
-        return jnp.concatenate([body, observation[..., 18:]], axis=-1)
-    x, y = observation[..., -2], observation[..., -1]
-    vector = jnp.stack([rows[0][j] * x + rows[1][j] * y for j in range(3)], axis=-1)
-    return jnp.concatenate([body, observation[..., 18:-2], vector], axis=-1)
+    first = [*rows[0], *rows[2]] if view.heading else [*rows[2]]
+    middle, end = 18 + 3 * view.vectors, len(numbers) - view.last
+    vectors = [x for at in range(18, middle, 3) for x in rotated(numbers[at : at + 3])]
+    last = rotated(numbers[end:]) if view.last else []
+    body = [*first, *rotated(numbers[9:12]), *rotated(numbers[12:15]), *numbers[15:18], *vectors]
+    return jnp.stack([*body, *numbers[middle:end], *last], axis=-1)
 
 
 def draw(start: Start, key: chex.PRNGKey) -> Body:

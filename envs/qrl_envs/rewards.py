@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from qrl_envs.pendulum import Pendulum
 from qrl_envs.quadrotor import Body
-from qrl_envs.task import CircleReward, HoverReward, PendulumReward
+from qrl_envs.task import CircleReward, HoverReward, PendulumReward, TrackReward
 
 
 def _norm(x: chex.Array) -> chex.Array:
@@ -24,7 +24,7 @@ class Hover(NamedTuple):
     w2_position_1_m: chex.Array
     w3_action: chex.Array
 
-    def __call__(self, body: Body, action: chex.Array) -> chex.Array:
+    def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
         """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) of the state after the step and the applied action [4].
 
         q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, the same attitude, cost the same.
@@ -47,7 +47,7 @@ class Circle(NamedTuple):
     radius_m: chex.Array
     speed_m_s: chex.Array
 
-    def __call__(self, body: Body, action: chex.Array) -> chex.Array:
+    def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
         """constant − (w4·d + w5·|chi| + w6·‖a‖) of the state after the step and the applied action [4].
 
         d is the distance to the circle and chi = x·vy − y·vx − r_des·v_des (paper, Sec. 5.3).
@@ -58,6 +58,39 @@ class Circle(NamedTuple):
         chi = x * vy - y * vx - self.radius_m * self.speed_m_s
         return self.constant - (
             self.w4_distance_1_m * d + self.w5_direction_s_m2 * jnp.abs(chi) + self.w6_action * _norm(action)
+        )
+
+
+HEADING_MARGIN = 1e-3  # keeps the gradient of the heading finite upside down, where there is none
+
+
+class Track(NamedTuple):
+    """Weights of `task.TrackReward`; scalars."""
+
+    constant: chex.Array
+    w_position_1_m: chex.Array
+    rounding_m: chex.Array
+    w_velocity_s_m: chex.Array
+    w_body_rate_s2_rad2: chex.Array
+    w_heading: chex.Array
+    w_change: chex.Array
+
+    def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
+        """Of the state after the step relative to the reference, its applied action [A], and the one `before` [A].
+
+        The heading ψ is that of the quaternion's twist about z: sin²(ψ/2) = z²/(w² + z²), whatever the tilt.
+        """
+        w, _, _, z = jnp.unstack(body.pose.attitude)
+        square = jnp.sum(body.pose.position_m**2, axis=0)
+        distance = jnp.sqrt(square + self.rounding_m**2) - self.rounding_m
+        rate = jnp.sum(body.twist.body_rate_rad_s**2, axis=0)
+        change = 0.0 if before is None else jnp.sum((action - before) ** 2, axis=0)
+        return self.constant - (
+            self.w_position_1_m * distance
+            + self.w_velocity_s_m * _norm(body.twist.velocity_m_s)
+            + self.w_body_rate_s2_rad2 * rate
+            + self.w_heading * z * z / (w * w + z * z + HEADING_MARGIN)
+            + self.w_change * change
         )
 
 
@@ -74,10 +107,12 @@ class SwingUp(NamedTuple):
         return -(self.w_angle_1_rad2 * theta**2 + self.w_rate_s2_rad2 * x.twist**2 + self.w_torque_1_N2m2 * torque**2)
 
 
-_FORMS = {"hover": Hover, "circle": Circle, "pendulum": SwingUp}
+_FORMS = {"hover": Hover, "circle": Circle, "track": Track, "pendulum": SwingUp}
 
 
-def from_spec(spec: HoverReward | CircleReward | PendulumReward) -> Hover | Circle | SwingUp:
+def from_spec(
+    spec: HoverReward | CircleReward | TrackReward | PendulumReward,
+) -> Hover | Circle | Track | SwingUp:
     """The reward of a task file, with its weights as float32 arrays."""
     kind = _FORMS[spec.form]
     return kind(*(jnp.float32(getattr(spec, field)) for field in kind._fields))

@@ -12,7 +12,9 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
+from qrl_envs import reference as references
 from qrl_envs import specfile
+from qrl_envs.reference import FixedReference, Reference, reference_data, shipped_references
 from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
 from qrl_envs.uncertainty import Uncertainty, shipped_uncertainties, uncertainty_data
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle, shipped_vehicles, vehicle_data, with_default_scale
@@ -85,27 +87,48 @@ class CircleReward(Spec):
         return self
 
 
+class TrackReward(Spec):
+    """constant − (w_position·(√(‖e‖² + rounding_m²) − rounding_m) + w_velocity·‖ė‖ + w_body_rate·‖ω‖² +
+    w_heading·sin²(ψ/2) + w_change·‖Δa‖²) of the error e to a reference, the heading ψ and the change of action Δa.
+    """
+
+    form: Literal["track"]
+    constant: Real = 0.0
+    w_position_1_m: NonNegative
+    rounding_m: Positive  # of the position's cost, which is quadratic below and linear above
+    w_velocity_s_m: NonNegative
+    w_body_rate_s2_rad2: NonNegative
+    w_heading: NonNegative
+    w_change: NonNegative
+
+
+MOST_PREVIEW_S = 2.0
 LAGGED = "with_lag"  # key of a task file: what else it says where its vehicle has rotors that lag, or drag
 W5_RADIUS_S_M = 0.5  # w5 of the 1 m circle
 
-FlightReward = Annotated[HoverReward | CircleReward, Field(discriminator="form")]
+FlightReward = Annotated[HoverReward | CircleReward | TrackReward, Field(discriminator="form")]
 
 
 class FlightEvaluation(Spec):
-    """Success: every tolerance holds throughout the last `tail_s` of a flight of `duration_s`."""
+    """Success: every tolerance holds throughout the last `tail_s` of a flight of `duration_s`. To track, the root mean
+    square of the distance is within its tolerance; by default `tail_s` begins when the first lap is over, or after 2 s.
+    """
 
     duration_s: Positive
     tail_s: Positive
     return_s: Positive
-    distance_m: Positive  # from the hover point, or from the circle
+    distance_m: Positive  # from the hover point, the circle, or the reference
     speed_m_s: Positive | None = None  # circle only: |tangential speed − reward's speed|
     start: FlightStart
     reward: FlightReward  # added up over the first `return_s` of the flight
+    reference: Annotated[FixedReference | None, Field(exclude_if=lambda x: x is None)] = None  # to track
 
     @model_validator(mode="after")
     def _consistent(self) -> "FlightEvaluation":
-        if (self.speed_m_s is None) != (self.reward.form == "hover"):
+        if (self.speed_m_s is None) != (self.reward.form != "circle"):
             raise ValueError("expected speed_m_s for the circle and for the circle alone")
+        if (self.reference is None) != (self.reward.form != "track"):
+            raise ValueError("expected a reference for a task that tracks one, and for that alone")
         return self
 
 
@@ -134,7 +157,10 @@ class QuadrotorTask(Spec):
     memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `vehicle.Later`
     # The frame of what a policy network is given: the world's, or the body's without the heading. As `vehicle.Later`.
     policy_frame: Annotated[Literal["world", "body"], Field(exclude_if=lambda x: x == "world")] = "world"
-    start: FlightStart
+    reference: Annotated[Reference | None, Field(exclude_if=lambda x: x is None)] = None  # to track, in training
+    # Times ahead at which the policy is given the reference's velocity. As `vehicle.Later`.
+    preview_s: Annotated[tuple[Positive, ...], Field(max_length=8, exclude_if=lambda x: x == ())] = ()
+    start: FlightStart  # from the hover point, the circle's center, or the reference
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
     bounds: Bounds
     reward: FlightReward
@@ -148,8 +174,9 @@ class QuadrotorTask(Spec):
                 raise ValueError(f"expected reward.{name} and evaluation.reward.{name} to be the same")
         if isinstance(train, CircleReward):
             self._check_circle(train)
-        elif self.policy_frame == "body":
-            raise ValueError("expected policy_frame 'world' to hover: in the body frame there is no heading to reach")
+        if (self.reference is None) != (train.form != "track"):
+            raise ValueError("expected a reference with a reward of form 'track', and with that alone")
+        self._check_references()
         for where, start in (("start", self.start), ("evaluation.start", self.evaluation.start)):
             reach = 3**0.5 * start.position_m
             if reach >= self.bounds.distance_m:
@@ -158,6 +185,18 @@ class QuadrotorTask(Spec):
                     f" {start.position_m:g} along each axis), found {self.bounds.distance_m:g}"
                 )
         return _periods_fit(self)
+
+    def _check_references(self) -> None:
+        if self.preview_s and self.reference is None:
+            raise ValueError("expected no preview_s without a reference")
+        if self.preview_s and max(self.preview_s) > MOST_PREVIEW_S:
+            raise ValueError(f"expected preview_s of at most {MOST_PREVIEW_S:g} s, found {max(self.preview_s):g}")
+        for key, found in (("reference", self.reference), ("evaluation.reference", self.evaluation.reference)):
+            if found is not None and not isinstance(found, references.Random):
+                try:
+                    references.check(found, self.vehicle)
+                except ValueError as error:
+                    raise ValueError(f"{key}: {error}") from None
 
     def _check_circle(self, circle: CircleReward) -> None:
         needed = circle.speed_m_s**2 / circle.radius_m
@@ -181,7 +220,7 @@ class QuadrotorTask(Spec):
     @property
     def ideal(self) -> bool:
         """Whether this is the paper's world: thrust at once, no drag, nothing uncertain, no memory."""
-        plain = self.memory == Memory() and self.policy_frame == "world"
+        plain = self.memory == Memory() and self.policy_frame == "world" and self.reference is None
         return self.vehicle.ideal and self.uncertainty is None and plain
 
     def warnings(self) -> list[str]:
@@ -263,7 +302,11 @@ def shipped() -> list[str]:
 
 
 # Parts of a task that may be a file of their own: what reads them, and the names of those that are shipped.
-_PARTS = {"vehicle": (vehicle_data, shipped_vehicles), "uncertainty": (uncertainty_data, shipped_uncertainties)}
+_PARTS = {
+    "vehicle": (vehicle_data, shipped_vehicles),
+    "uncertainty": (uncertainty_data, shipped_uncertainties),
+    "reference": (reference_data, shipped_references),
+}
 
 
 def _shipped(name: str) -> dict[str, Any]:
@@ -271,13 +314,15 @@ def _shipped(name: str) -> dict[str, Any]:
     return data | {"vehicle": vehicle_data(named)} if isinstance(named := data.get("vehicle"), str) else data
 
 
-def load(name_or_path: str, vehicle: str | None = None, uncertainty: str | None = None) -> Task:
-    """The task of a shipped name or of a `.json` file, with the `vehicle` and the `uncertainty` of that name or file
-    where one is given.
+def load(
+    name_or_path: str, vehicle: str | None = None, uncertainty: str | None = None, reference: str | None = None
+) -> Task:
+    """The task of a shipped name or of a `.json` file, with the `vehicle`, the `uncertainty` and the `reference` of
+    that name or file where one is given.
 
     Raises BadInput with a message of one line.
     """
-    parts = {"vehicle": vehicle, "uncertainty": uncertainty}
+    parts = {"vehicle": vehicle, "uncertainty": uncertainty, "reference": reference}
     if name_or_path in shipped():
         return from_data(_shipped(name_or_path), name_or_path, parts=parts)
     if name_or_path.endswith(".json"):
@@ -291,8 +336,8 @@ def from_data(
 ) -> Task:
     """The task of a JSON object, which may `extend` a shipped task; error messages begin with `where`.
 
-    Its keys `vehicle` and `uncertainty` may each be an object, a shipped name or a `.json` path, from `folder` on;
-    `parts`, names or paths by key, replace them.
+    Its keys `vehicle`, `uncertainty` and `reference`, and that of its evaluation, may each be an object, a shipped name
+    or a path, from `folder` on; `parts`, names or paths by key, replace them, a reference that of the evaluation too.
     """
     data = extended(data, where)
     lagged = data.pop(LAGGED, {})
@@ -301,34 +346,52 @@ def from_data(
     if _lags(data.get("vehicle")):
         left = {key: value for key, value in lagged.items() if parts.get(key) is None}
         data = _with_parts(specfile.merge(data, left), where, folder, {})
-    return specfile.build(_ANY_TASK, _completed(data), where)
+    return specfile.build(_ANY_TASK, _completed(data, where), where)
 
 
 def _with_parts(data: dict[str, Any], where: str, folder: Path, parts: Mapping[str, str | None]) -> dict[str, Any]:
     """`data` with its parts read from their files."""
     for key, (read, known) in _PARTS.items():
         if (asked := parts.get(key)) is not None:
-            if data.get("world") != "quadrotor":
+            if data.get("world") != "quadrotor" or (key == "reference" and key not in data):
                 raise BadInput(f"{where}: has no {key} to replace by '{asked}'")
             data = {**data, key: read(asked)}
+            if key == "reference":
+                data = with_reference(data, data[key])
         elif isinstance(named := data.get(key), str):
             try:
                 data = {**data, key: read(named if named in known() else str(folder / named))}
             except BadInput as error:
                 raise BadInput(f"{where}: key '{key}': {error}") from None
+    evaluation = data.get("evaluation")
+    if isinstance(evaluation, dict) and isinstance(named := evaluation.get("reference"), str):
+        try:
+            read = reference_data(named if named in shipped_references() else str(folder / named))
+        except BadInput as error:
+            raise BadInput(f"{where}: key 'evaluation.reference': {error}") from None
+        data = {**data, "evaluation": {**evaluation, "reference": read}}
     return data
+
+
+def with_reference(data: dict[str, Any], reference: dict[str, Any]) -> dict[str, Any]:
+    """A task object whose evaluation follows `reference`, for as long as that takes."""
+    evaluation = {k: v for k, v in data.get("evaluation", {}).items() if k not in ("duration_s", "tail_s")}
+    return {**data, "evaluation": {**evaluation, "reference": reference}}
 
 
 def _positive(value: Any) -> bool:
     return isinstance(value, int | float) and 0 < value < 1e9
 
 
-def _completed(data: dict[str, Any]) -> dict[str, Any]:
+def _completed(data: dict[str, Any], where: str) -> dict[str, Any]:
     """A task object with the values that follow from others, and its durations, which the first version counted in
     steps, in seconds.
     """
     evaluation = dict(part) if isinstance(part := data.get("evaluation"), dict) else part
     data = data | {"evaluation": evaluation} if "evaluation" in data else dict(data)
+    if isinstance(evaluation, dict) and isinstance(followed := evaluation.get("reference"), dict):
+        duration_s, tail_s = references.evaluation_s(specfile.build(FixedReference, followed, f"{where}: reference"))
+        evaluation |= {"duration_s": duration_s, "tail_s": tail_s} | evaluation
     period = data.get("control_period_s")
     for part, former, name in ((data, "episode_steps", "episode_s"), (evaluation, "return_steps", "return_s")):
         if isinstance(part, dict) and isinstance(period, int | float) and _positive(part.get(former)):

@@ -116,6 +116,7 @@ def train(
     out: str | Path | None = None,
     *,
     uncertainty: str | Path | None = None,
+    reference: str | Path | None = None,
     preset: str | None = None,
     resume: bool = False,
     quiet: bool = False,
@@ -128,6 +129,7 @@ def train(
     config: a Config, or a config.json, whole or in part
     out: the run folder, by default runs/TASK
     uncertainty: what differs from flight to flight, a shipped name or a path to a .json, in place of the task's own
+    reference: what a task tracks and is judged on, a shipped name or a path to a .json or .csv, in place of its own
     preset: hyperparameters by name, in place of the task's preset; not together with a Config, which has them all
     resume: continue the run that the folder holds; one that is complete is loaded
     quiet: print nothing
@@ -138,7 +140,7 @@ def train(
     _configure_jax()
     parts = {
         key: None if value is None else str(value)
-        for key, value in (("vehicle", vehicle), ("uncertainty", uncertainty))
+        for key, value in (("vehicle", vehicle), ("uncertainty", uncertainty), ("reference", reference))
     }
     if isinstance(config, Config):
         if preset is not None:

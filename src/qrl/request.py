@@ -40,7 +40,7 @@ def run_config(
 ) -> RunConfig:
     """The run asked for: flags over CONFIG (`file`, read from `config`) over `preset`, or the task's, over the default.
 
-    `parts`: names or paths of the task's vehicle and uncertainty, in place of its own. The run names no devices yet:
+    `parts`: names or paths of the task's vehicle, uncertainty and reference, in place of its own. The run names no devices yet:
     JAX has not been asked for them.
     """
     record = file.task

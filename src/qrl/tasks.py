@@ -20,6 +20,7 @@ from qrl.runs.record import RunConfig, TaskRecord, with_current_names
 from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
+from qrl_envs.reference import reference_data
 from qrl_envs.specfile import BadInput
 
 PRESET_RECOVERY_S = 0.6  # and the time scale of their vehicle, the paper's (Vehicle.recovery_s)
@@ -41,7 +42,7 @@ def foreign_tasks() -> list[str]:
 
 def task_record(name: str, parts: Mapping[str, str | None] = MappingProxyType({})) -> TaskRecord:
     """The task of a shipped name, a `.json` path, one of Brax's names, or "module:factory"; of a task of our own worlds
-    with other `parts`, a vehicle and an uncertainty, by name or file.
+    with other `parts`, a vehicle, an uncertainty and a reference, by name or file.
     """
     asked = {key: value for key, value in parts.items() if value is not None}
     own = name in task_spec.shipped() or name.endswith(".json")
@@ -121,6 +122,17 @@ def spec(record: TaskRecord) -> task_spec.Task:
     return task_spec.from_data(record.spec, record.name)
 
 
+def following(record: TaskRecord, reference: str | None) -> TaskRecord:
+    """The task whose evaluation follows the reference of that name or file, in place of its own; None: its own."""
+    if reference is None:
+        return record
+    if record.spec is None or "reference" not in record.spec:
+        raise BadInput(f"--reference: expected a task that tracks one, found '{record.name}'")
+    given = task_spec.with_reference(record.spec, reference_data(reference))
+    task = task_spec.from_data(given, f"{record.name} with reference {reference}")
+    return TaskRecord(name=record.name, spec=task.model_dump(mode="json", exclude_none=True))
+
+
 def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
     if record.spec is not None:
         spec = task_spec.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
@@ -169,7 +181,7 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
             each = vehicle.action_scale_N * len(vehicle.motors) / vehicle.mass_kg
             values["apg_learning_rate"] *= min(1.0, PRESET_ACTION_M_S2 / each)
         if not task.ideal and values["observation_scale"]:
-            values["observation_scale"] = [*values["observation_scale"], *_memory_scale(task)]
+            values["observation_scale"] = [*values["observation_scale"], *_other_scales(task)]
     reward = task.reward
     if isinstance(reward, task_spec.CircleReward) and values["observation_scale"]:
         length, speed = max(1.0, reward.radius_m), max(1.0, abs(reward.speed_m_s) / 2.0)
@@ -183,16 +195,18 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
 # lost a policy that flew.
 PRESET_ACTION_M_S2 = 22.1
 INTEGRAL_SCALE_1_M_S = 6.0
+PREVIEW_SCALE_S_M = 0.5
 
 
-def _memory_scale(task: task_spec.QuadrotorTask) -> list[float]:
+def _other_scales(task: task_spec.QuadrotorTask) -> list[float]:
     """Scales of what an environment of a real vehicle observes beside the 18 numbers of the paper's."""
     env = worlds.from_task(task)
     motors = len(task.vehicle.motors) * task.memory.previous_action
-    integrals = (env.policy_observation_size or 18) - 18 - motors
-    return (
-        [1.0] * motors + [INTEGRAL_SCALE_1_M_S] * integrals + [1.0] * (env.observation_size - 18 - motors - integrals)
-    )
+    ahead = 3 * len(task.preview_s)
+    seen = env.policy_observation_size or 18
+    integrals = seen - 18 - ahead - motors
+    critic = env.observation_size - seen
+    return [PREVIEW_SCALE_S_M] * ahead + [1.0] * motors + [INTEGRAL_SCALE_1_M_S] * integrals + [1.0] * critic
 
 
 def check(env: Env, learner: Config, where: str) -> None:
@@ -231,23 +245,24 @@ def check(env: Env, learner: Config, where: str) -> None:
 
 def _check_frame(env: Env, learner: Config, where: str) -> None:
     """Whether what a policy is given in the body frame is scaled alike along all axes."""
-    task = getattr(env, "task", None)
-    if getattr(task, "policy_frame", "world") == "world":
+    if (view := getattr(env, "body_view", None)) is None:
         return
     if learner.normalize_observations:
         raise BadInput(f"{where}: key 'normalize_observations': expected false for a task with policy_frame 'body'")
-    scale = learner.observation_scale or (1.0,) * 18
-    if len({*scale[:9], 1.0}) + len({*scale[9:12]}) + len({*scale[12:15]}) > 3:
+    scale = learner.observation_scale or (1.0,) * (env.observation_size)
+    if {*scale[:9]} != {1.0}:
         raise BadInput(
-            f"{where}: key 'observation_scale': expected 1 for the rotation matrix, and the same along x, y and z for"
-            f" position and for velocity, for a task with policy_frame 'body'; found {list(scale[:15])}"
+            f"{where}: key 'observation_scale': expected 1 for the rotation matrix, for a task with policy_frame"
+            f" 'body'; found {list(scale[:9])}"
         )
-    seen = getattr(env, "policy_observation_size", None) or 0
-    if seen > 18 and len({*scale[seen - 2 : seen]}) > 1:
-        raise BadInput(
-            f"{where}: key 'observation_scale': expected the same of the last two numbers that the policy sees, which"
-            f" are a vector, for a task with policy_frame 'body'; found {list(scale[seen - 2 : seen])}"
-        )
+    seen = getattr(env, "policy_observation_size", None) or 18
+    vectors = [slice(at, at + 3) for at in (9, 12, *range(18, 18 + 3 * view.vectors, 3))]
+    for part in [*vectors, slice(seen - view.last, seen)]:
+        if len({*scale[part]}) > 1:
+            raise BadInput(
+                f"{where}: key 'observation_scale': expected the same of numbers {part.start + 1} to {part.stop}, which"
+                f" are a vector, for a task with policy_frame 'body'; found {list(scale[part])}"
+            )
 
 
 MOST_SEEDS = 10_000  # of one program

@@ -43,8 +43,10 @@ class Comparison(NamedTuple):
 
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every seed of a run from fresh starts; print a table, write evaluation.json and plots to each folder."""
-    config = tasks.load_run_config(args.run)
-    others = [(folder, _of_same_task(folder, args.run, config)) for folder in dict.fromkeys(args.beside)]
+    config = _following(tasks.load_run_config(args.run), args.reference)
+    others = [
+        (folder, _of_same_task(folder, args.run, config, args.reference)) for folder in dict.fromkeys(args.beside)
+    ]
     task = tasks.spec(config.task) if config.task.spec else None
     named = _conditions(args.run, config, task) if args.off_nominal else {}
     envs = {NOMINAL: tasks.environment(config.task)}
@@ -93,9 +95,13 @@ def _conditions(folder: Path, config: RunConfig, task: Task | None) -> dict[str,
     return conditions(task)
 
 
-def _of_same_task(folder: Path, run: Path, config: RunConfig) -> RunConfig:
+def _following(config: RunConfig, reference: str | None) -> RunConfig:
+    return config.model_copy(update={"task": tasks.following(config.task, reference)})
+
+
+def _of_same_task(folder: Path, run: Path, config: RunConfig, reference: str | None) -> RunConfig:
     """The run in `folder`; BadInput unless it has the task of `run`. Training settings may differ."""
-    other = tasks.load_run_config(folder)
+    other = _following(tasks.load_run_config(folder), reference)
     if other.task.name != config.task.name or _evaluation_spec(other) != _evaluation_spec(config):
         raise BadInput(
             f"{folder}: --beside: expected a run of the same task as {run}, '{config.task.name}', found one of"
@@ -109,7 +115,7 @@ def _of_same_task(folder: Path, run: Path, config: RunConfig) -> RunConfig:
 
 def _evaluation_spec(config: RunConfig) -> dict[str, Any]:
     """The part of a task that evaluation depends on, without settings of training and names."""
-    own = ("description", "preset", "start", "envelope", "episode_steps", "reward")
+    own = ("description", "preset", "start", "envelope", "episode_steps", "reward", "reference")
     return {key: value for key, value in (config.task.spec or {}).items() if key not in own}
 
 

@@ -78,6 +78,12 @@ def build_parser() -> _Parser:
         metavar="UNCERTAINTY",
         help="what differs from flight to flight: a shipped name or a .json file (default: the task's own)",
     )
+    figure = "a shipped reference's name, a .json or a .csv file"
+    train.add_argument(
+        "--reference",
+        metavar="REFERENCE",
+        help=f"what to track and to be judged on: {figure} (default: the task's own)",
+    )
     train.add_argument("--seed", type=whole_number, metavar="N", help="first seed (default 0)")
     train.add_argument("--seeds", type=count, metavar="N", help="number of seeds, trained in one program (default 1)")
     train.add_argument("--out", type=Path, metavar="FOLDER", help="run folder (default runs/TASK)")
@@ -91,6 +97,10 @@ def build_parser() -> _Parser:
     view = commands.add_parser("view", help="write flights of a trained policy as a 3D page")
     for command in (evaluate, export, view):
         command.add_argument("run", type=Path, metavar="RUN", help="run folder")
+    for command in (evaluate, view):
+        command.add_argument(
+            "--reference", metavar="REFERENCE", help=f"what to track: {figure} (default: the task's own)"
+        )
     for command in (evaluate, export):
         command.add_argument("--starts", type=count, default=1000, metavar="N", help="number of starts (default 1000)")
     conditions = "also fly with RK4, latency, sensor noise; hover: the paper's trial"
@@ -271,6 +281,7 @@ def _list_tasks(_: argparse.Namespace) -> int:
     from qrl import tasks
     from qrl.cli.terminal import console
     from qrl_envs import task as task_spec
+    from qrl_envs.reference import shipped_references
     from qrl_envs.uncertainty import shipped_uncertainties
     from qrl_envs.vehicle import shipped_vehicles
 
@@ -279,5 +290,6 @@ def _list_tasks(_: argparse.Namespace) -> int:
     console.print(f"\nBrax's own: {', '.join(tasks.foreign_tasks())}")
     console.print(f"Vehicles (VEHICLE=): {', '.join(shipped_vehicles())}, or a .json file of yours")
     console.print(f"Uncertainties (UNCERTAINTY=): {', '.join(shipped_uncertainties())}, or a .json file of yours")
+    console.print(f"References (REFERENCE=): {', '.join(shipped_references())}, or a .json or .csv file of yours")
     console.print("Your environment: module:factory, a function that returns an environment with Brax's reset and step")
     return DONE

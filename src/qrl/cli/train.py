@@ -61,6 +61,7 @@ def train(args: argparse.Namespace) -> int:
             finished = run(plan, stopped)
     if finished is None:
         asked = {"TASK": args.task, "CONFIG": args.config, "VEHICLE": args.vehicle, "UNCERTAINTY": args.uncertainty}
+        asked["REFERENCE"] = args.reference
         subject = " ".join(f"{name}={shlex.quote(str(value))}" for name, value in asked.items() if value)
         console.print(f"stopped and saved; to resume: make train {subject} OUT={shlex.quote(str(plan.out))} RESUME=1")
         return FAILED
@@ -73,7 +74,7 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     """What to train, and where; None: it is complete. The folder is locked until `stack` closes."""
     flags = _flags(args)
     file = request.config_file(args.config)
-    parts = {"vehicle": args.vehicle, "uncertainty": args.uncertainty}
+    parts = {"vehicle": args.vehicle, "uncertainty": args.uncertainty, "reference": args.reference}
     config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds, parts, args.preset)
     out: Path = args.out or Path("runs") / tasks.folder_name(config.task)
     if out.exists() and not out.is_dir():

@@ -1,0 +1,99 @@
+"""References in flight: position and velocity at each step, and the preview, which is what a policy sees of the time
+ahead: the reference's velocity then minus its velocity now. For one flight; the caller vmaps, or lets flights lie along
+trailing axes.
+
+A `Figure` is known beforehand; `Motion` is drawn for each flight.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from qrl_envs.quadrotor import Physics
+from qrl_envs.reference import VERTICAL, Fixed, Random
+
+
+class Target(NamedTuple):
+    """The reference now, and the preview; of one flight, or of flights along trailing axes."""
+
+    position_m: chex.Array  # [3]
+    velocity_m_s: chex.Array  # [3]
+    preview_m_s: chex.Array  # [3k] for k times ahead
+
+
+class Figure:
+    """A fixed reference in compiled code: a table of its steps. A flight begins at its own place on a lap."""
+
+    draws = 1
+
+    def __init__(self, spec: Fixed, dt_s: float, flight_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
+        self._laps = round((spec.lap_s or 0.0) / dt_s) if anywhere else 0
+        self._ahead = [round(time_s / dt_s) for time_s in ahead_s]
+        steps = round(flight_s / dt_s) + self._laps + max(self._ahead, default=0) + 2
+        found = spec.at(np.arange(steps) * dt_s)
+        self._table = np.concatenate([found.position_m, found.velocity_m_s], axis=1).astype(np.float32)
+
+    def draw(self, u: chex.Array, physics: Physics, thrust: chex.Array) -> Any:
+        """Where on the figure a flight begins, from u [1] uniform in [0, 1); int32 []."""
+        del physics, thrust
+        return jnp.floor(u[0] * self._laps).astype(jnp.int32)
+
+    def at(self, begin: Any, steps: chex.Array) -> Target:
+        """The target of a flight that has made `steps` [...] and began at `begin` [...]."""
+        table, last = jnp.asarray(self._table), len(self._table) - 1
+
+        def row(ahead: int) -> chex.Array:
+            return jnp.moveaxis(table[jnp.minimum(begin + steps + ahead, last)], -1, 0)
+
+        now = row(0)
+        preview = [row(ahead)[3:] - now[3:] for ahead in self._ahead]
+        return Target(now[:3], now[3:], jnp.concatenate(preview) if preview else now[:0])
+
+
+class Sines(NamedTuple):
+    """Σ_k amplitude·sin(rate·t + phase) along each axis."""
+
+    amplitude_m: chex.Array  # [3, 2]
+    rate_rad_s: chex.Array  # [3, 2]
+    phase_rad: chex.Array  # [3, 2]
+
+
+class Motion:
+    """Random motion in compiled code, drawn for each flight."""
+
+    draws = 19
+
+    def __init__(self, spec: Random, dt_s: float, ahead_s: Sequence[float]) -> None:
+        self._spec, self._dt_s, self._ahead_s = spec, dt_s, tuple(ahead_s)
+
+    def draw(self, u: chex.Array, physics: Physics, thrust: chex.Array) -> Sines:
+        """A flight's motion, from u [19] uniform in [0, 1); `thrust`: the greatest of all motors [N] []."""
+        spec = self._spec
+        rates, sizes, phases = u[1:].reshape(3, 3, 2)
+        low, high = np.log(spec.rate_rad_s)
+        rate = jnp.exp(low + (high - low) * rates)
+        size = spec.amplitude_m * jnp.abs(jax.scipy.special.ndtri(0.5 + 0.5 * sizes))
+        size = jnp.minimum(size, spec.speed_m_s / rate) * jnp.array([1.0, 1.0, VERTICAL])[:, None]
+        lift = thrust / (physics.mass_kg * physics.gravity_m_s2)
+        # At four fifths of the squared thrust, so that some is left for height.
+        most = spec.acceleration_share * physics.gravity_m_s2 * jnp.sqrt(jnp.maximum(0.8 * lift**2 - 1.0, 0.05))
+        needed = jnp.linalg.norm(jnp.sum(size * rate**2, axis=1))
+        size = size * jnp.minimum(1.0, jnp.clip(most, 0.5, 8.0) / needed) * (u[0] < spec.moving)
+        return Sines(size, rate, 2.0 * jnp.pi * phases)
+
+    def at(self, motion: Sines, steps: chex.Array) -> Target:
+        """As `Figure.at`."""
+        size, rate, phase = motion
+        angle = rate * (steps * self._dt_s) + phase
+        sine, cosine = jnp.sin(angle), jnp.cos(angle)
+        speed = size * rate
+        velocity = jnp.sum(speed * cosine, axis=1)
+        preview = []
+        for time_s in self._ahead_s:  # by the sum of angles: of the rate alone, which is constant during a flight
+            later = cosine * jnp.cos(rate * time_s) - sine * jnp.sin(rate * time_s)
+            preview.append(jnp.sum(speed * later, axis=1) - velocity)
+        return Target(jnp.sum(size * sine, axis=1), velocity, jnp.concatenate(preview) if preview else velocity[:0])
