@@ -429,4 +429,4 @@ def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
     shipped_base = _shipped(base)
     given = {key: value for key, value in data.items() if key != "extend"}
     lagged = specfile.merge(_without(shipped_base.get(LAGGED, {}), given), given.get(LAGGED, {}))
-    return specfile.merge(shipped_base, given) | ({LAGGED: lagged} if lagged else {})
+    return specfile.merge(shipped_base, given) | {LAGGED: lagged}

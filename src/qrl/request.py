@@ -40,8 +40,8 @@ def run_config(
 ) -> RunConfig:
     """The run asked for: flags over CONFIG (`file`, read from `config`) over `preset`, or the task's, over the default.
 
-    `parts`: names or paths of the task's vehicle, uncertainty and reference, in place of its own. The run names no devices yet:
-    JAX has not been asked for them.
+    `parts`: names or paths of the task's vehicle, uncertainty and reference, in place of its own. The run names no
+    devices yet: JAX has not been asked for them.
     """
     record = file.task
     assert not isinstance(record, str)  # config_file saw to it

@@ -15,7 +15,14 @@ from qrl_envs.env import RealQuadrotorEnv, from_task
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
-CASES = [("hover", None), ("circle", None), ("pendulum", None), ("hover", "hexa"), ("circle", "crazyflie")]
+CASES = [
+    ("hover", None),
+    ("circle", None),
+    ("pendulum", None),
+    ("hover", "hexa"),
+    ("circle", "crazyflie"),
+    ("track", None),
+]
 
 
 @pytest.mark.parametrize(("name", "vehicle"), [*CASES, ("hover", "tilted")])

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 from test_quadrotor import flat, newton_euler
 
-from qrl.export.policy import in_body_frame
+from qrl.export.policy import BodyFrame
 from qrl_envs import plant, quadrotor, rotors, task
 from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.uncertainty import Uncertainty
@@ -274,7 +274,8 @@ def test_in_the_body_frame_neither_heading_nor_azimuth_shows() -> None:
     wanted = [to_body @ [0, 0, 1], to_body @ seen[9:12], to_body @ seen[12:15], seen[15:-2], moved]
     view = env.policy_view(jnp.asarray(seen))
     np.testing.assert_allclose(view, np.concatenate(wanted), atol=1e-6)
-    np.testing.assert_allclose(in_body_frame(seen[None], horizontal=True)[0], view, atol=1e-6)
+    assert env.body_view
+    np.testing.assert_allclose(BodyFrame(*env.body_view)(seen[None])[0], view, atol=1e-6)
     turn = Rotation.from_euler("z", 1.1).as_matrix()
     other = np.concatenate(
         [(turn @ to_body.T).ravel(), turn @ seen[9:12], turn @ seen[12:15], seen[15:-2], turn[:2, :2] @ seen[-2:]]

@@ -16,6 +16,7 @@ from qrl_envs import quadrotor
 from qrl_envs import task as tasks
 from qrl_envs.env import TaskEnv
 from qrl_envs.symmetry import Symmetry
+from qrl_envs.target import Sines
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 DRAWS = 64
@@ -83,12 +84,15 @@ def test_a_transformed_step_is_the_step_transformed(name: str, vehicle: dict[str
     assert len(np.unique(np.round(P, 3) + 0.0, axis=0)) == permutations
 
 
-@pytest.mark.parametrize(("name", "permutations"), [("crazyflie", 4), ("hexa", 2)])
-def test_a_real_vehicles_step_is_transformed_with_its_world(name: str, permutations: int) -> None:
-    """What is drawn for the flight turns with it: forces and wind as vectors, torques as pseudovectors, motors by
-    permutation; so do memory and what the critic sees. A hexarotor's spins allow the mirror image about x alone.
+@pytest.mark.parametrize(
+    ("name", "vehicle", "permutations"), [("hover", "crazyflie", 4), ("hover", "hexa", 2), ("track", "crazyflie", 4)]
+)
+def test_a_real_vehicles_step_is_transformed_with_its_world(name: str, vehicle: str, permutations: int) -> None:
+    """What is drawn for the flight turns with it: forces, wind and the reference as vectors, torques as pseudovectors,
+    motors by permutation; so do memory and what the critic sees. A hexarotor's spins allow the mirror image about x
+    alone.
     """
-    task = tasks.load("hover", name)
+    task = tasks.load(name, vehicle)
     env, rng = worlds.RealQuadrotorEnv(task), np.random.default_rng(0)  # pyright: ignore[reportArgumentType]
     found = draws(env, DRAWS)
     keys = jax.random.split(jax.random.PRNGKey(0), DRAWS)
@@ -107,6 +111,15 @@ def test_a_real_vehicles_step_is_transformed_with_its_world(name: str, permutati
     def by(matrices: np.ndarray, vectors: Any) -> jax.Array:
         return jnp.asarray(np.einsum("nij,nj->ni", matrices, vectors), jnp.float32)
 
+    def reference_of(drawn: Any) -> Any:
+        """The map permutes and reflects axes: so do amplitudes; rates and phases are permuted."""
+        if not drawn:
+            return drawn
+        signs = np.repeat(world.sum(axis=2)[:, :, None], 2, axis=2)
+        places = np.abs(world)
+        size, rate, phase = (jnp.asarray(np.einsum("nij,njk->nik", places, x), jnp.float32) for x in drawn)
+        return Sines(jnp.asarray(signs * size, jnp.float32), rate, phase)
+
     def turned(x: Any) -> Any:
         pushed = x.world.disturbance
         observation = jax.vmap(quadrotor.observe)(x.body)
@@ -119,6 +132,7 @@ def test_a_real_vehicles_step_is_transformed_with_its_world(name: str, permutati
             previous_action=by(found.action, x.previous_action),
             integral_m_s=by(world, x.integral_m_s),
             world=x.world._replace(
+                reference=reference_of(x.world.reference),
                 motor_factor=by(found.action, x.world.motor_factor),
                 disturbance=pushed._replace(
                     force_N=by(world, pushed.force_N),

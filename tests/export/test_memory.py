@@ -14,7 +14,7 @@ import pytest
 
 import policies
 from cross_targets import EACH, EITHER, need
-from policies import HOVER, ODD, REMEMBERING
+from policies import HOVER, ODD, REMEMBERING, TRACK
 from qrl.export import emit, targets, vectors
 from qrl.export import kernel as reference
 from qrl.export.kernel import INT16, Kernel, accumulator_bound
@@ -179,17 +179,22 @@ def literal_integers(kernel: Kernel, x: list[int] | None, action: list[int], tot
     kept = (action if kernel.memory.initial_action is not None else []) + (total if kernel.memory.integral else [])
     columns = zip(kept, kernel.memory.shift, kernel.memory.low, kernel.memory.high, strict=True)
     if turn := kernel.turn:
-        inputs = [rounded(q, turn.up) for q in x[6:9]]
-        for at, shift in ((9, turn.position), (12, turn.velocity)):
+
+        def rotated(at: int, shift: int) -> list[int]:
             sums = [sum(x[3 * i + j] * x[at + i] // 2 for i in range(3)) for j in range(3)]
-            inputs += [limited(rounded(one, shift), -32767, 32767) for one in sums]
-        inputs += x[15:]
+            return [limited(rounded(one, shift), -32767, 32767) for one in sums]
+
+        inputs = [rounded(q, turn.up) for q in (x[:3] if turn.heading else []) + x[6:9]]
+        inputs += rotated(9, turn.position) + rotated(12, turn.velocity) + x[15:18]
+        for k in range(turn.vectors):
+            inputs += rotated(18 + 3 * k, turn.ahead)
     else:
         inputs = [rounded(q, int(shift)) for q, shift in zip(x, kernel.obs_shift, strict=True)]
     inputs += [limited(rounded(q, int(shift)), low, high) for q, shift, low, high in columns]
-    if kernel.turn:
-        *inputs, a, b = inputs
-        inputs += [rounded(x[j] * a // 2 + x[3 + j] * b // 2, 15) for j in range(3)]
+    if kernel.turn and (n := kernel.turn.last):
+        inputs, vector = inputs[:-n], inputs[-n:]
+        sums = [sum(x[3 * i + j] * vector[i] // 2 for i in range(n)) for j in range(3)]
+        inputs += [limited(rounded(one, 15), -32767, 32767) for one in sums]
     action[:] = reference.network(kernel, np.array([inputs]))[0].tolist()  # literal in test_kernel.py
 
 
@@ -675,9 +680,19 @@ def test_the_manifest_says_what_the_state_holds(which: str) -> None:
     found = json.loads(emit.files(policy, kernel, vectors.golden(policy, kernel), "ours")["manifest.json"])
     sizes, memory = REMEMBERING[which]
     assert (found["format"], found["name"], found["vehicle"]) == (2, "ours", None)
-    sizes_bytes = {"both": 20, "circle": 24, "action": 8, "integral": 12, "one action": 16, "odd": 16}
-    assert found["state_bytes"] == sizes_bytes[which]
+    sizes_bytes = {
+        "circle": 24,
+        "body": 8,
+        "world circle": 16,
+        "action": 8,
+        "integral": 12,
+        "one action": 16,
+        "odd": 16,
+    }
+    assert found["state_bytes"] == sizes_bytes.get(which, 20)
     assert found["network"] == [len(policy.layers[0][0]), *sizes[1:]]
+    if sizes == TRACK:
+        assert [port.get("ahead_s") for port in found["obs"]] == [None] * 18 + [0.1] * 3 + [0.5] * 3
     assert len(found["obs"]) == sizes[0]
     assert (found["memory"]["previous_action"] is not None) == memory.previous_action
     if memory.previous_action and sizes == HOVER:

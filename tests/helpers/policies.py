@@ -1,6 +1,6 @@
 """Policies without training: seeded networks of any shape, with flights made up for them to be calibrated on."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -10,7 +10,7 @@ import numpy as np
 from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.kernel import Kernel
-from qrl.export.policy import ACTIVATIONS, ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import ACTIVATIONS, ActionSpec, BodyFrame, Integral, Memory, ObservationSpec, Policy, Provenance
 from qrl.export.quantize import quantize
 from qrl.export.vectors import Vectors
 from qrl_envs import io_spec
@@ -25,6 +25,7 @@ PROVENANCE = Provenance(
     env_steps=1_234_567,
 )
 HOVER, PENDULUM, ODD, FLAT = (18, 64, 64, 4), (3, 64, 64, 1), (5, 7, 3, 2), (18, 4)
+TRACK = (24, 40, 4)  # with a preview of two times
 
 NAME = "hover"  # of kernels, unless another is given
 
@@ -54,6 +55,13 @@ def hover_flights(rng: np.random.Generator, n: int) -> np.ndarray:
     return np.concatenate([np.array(rotation).reshape(9, n).T, moving], axis=1).astype(np.float32)
 
 
+def track_flights(rng: np.random.Generator, n: int) -> np.ndarray:
+    """Observations [n, 24]: as of hover, and two previews."""
+    return np.concatenate([hover_flights(rng, n), rng.normal(size=(n, 6)) * [0.3, 0.3, 0.1, 1, 1, 0.4]], axis=1).astype(
+        np.float32
+    )
+
+
 def pendulum_flights(rng: np.random.Generator, n: int) -> np.ndarray:
     """Observations [n, 3], many of them at rest near upright."""
     left = rng.uniform(0.0, 1.0, n) ** 3
@@ -68,9 +76,11 @@ def odd_flights(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def _specs(sizes: tuple[int, ...]) -> tuple[tuple[ObservationSpec, ...], tuple[ActionSpec, ...]]:
-    name = {(18, 4): "hover", (3, 1): "pendulum"}.get((sizes[0], sizes[-1]))
+    name = {(18, 4): "hover", (24, 4): "track", (3, 1): "pendulum"}.get((sizes[0], sizes[-1]))
     if name:
         task = tasks.load(name)
+        if name == "track":
+            task = task.model_copy(update={"preview_s": (0.1, 0.5)})
         return (
             tuple(ObservationSpec(**port._asdict()) for port in io_spec.observations(task)),
             tuple(ActionSpec(**port._asdict()) for port in io_spec.actions(task)),
@@ -88,7 +98,7 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
     The odd one normalizes its observations and clips them, as a run with `normalize_observations` does.
     """
     rng = np.random.default_rng([seed, *sizes])
-    flights = {18: hover_flights, 3: pendulum_flights, 5: odd_flights}[sizes[0]](rng, samples)
+    flights = {18: hover_flights, 24: track_flights, 3: pendulum_flights, 5: odd_flights}[sizes[0]](rng, samples)
     normalized = sizes == ODD
     observations, actions = _specs(sizes)
     made = Policy(
@@ -112,11 +122,14 @@ def policy(sizes: tuple[int, ...] = HOVER, activation: str = "relu", seed: int =
     return replace(made, layers=(*rest, (weight, bias - middle)))
 
 
-# Both kinds of memory, and each alone; a circle, in the body frame; an odd number of actions; positions of very
-# different sizes and steps, clipped.
+# Both kinds of memory, and each alone; in the body frame a circle, a preview, and no integral; a circle in the world
+# frame; an odd number of actions; positions of very different sizes and steps, clipped.
 REMEMBERING = {
     "both": (HOVER, Memory(True, Integral((9, 10, 11), radius_m=1.0, limit_m_s=0.4))),
     "circle": (HOVER, Memory(True, Integral((9, 10, 11), radius_m=0.9, limit_m_s=0.3, circle_m=1.5))),
+    "track": (TRACK, Memory(True, Integral((9, 10, 11), radius_m=0.5, limit_m_s=0.6))),
+    "body": (HOVER, Memory(True, None)),
+    "world circle": (HOVER, Memory(False, Integral((9, 10, 11), radius_m=0.4, limit_m_s=0.2, circle_m=0.5))),
     "action": (HOVER, Memory(True, None)),
     "integral": (HOVER, Memory(False, Integral((9, 10, 11), radius_m=0.3, limit_m_s=0.05))),
     "one action": (PENDULUM, Memory(True, Integral((2, 0, 1), radius_m=3.0, limit_m_s=1.0))),
@@ -124,20 +137,24 @@ REMEMBERING = {
 }
 
 
-def in_body_frame(base: Policy) -> Policy:
+FRAMES = {"circle": BodyFrame(False, 0, 2), "track": BodyFrame(True, 2, 3), "body": BodyFrame(False, 0, 0)}
+
+
+def in_body_frame(base: Policy, frame: BodyFrame) -> Policy:
     """A policy of a vehicle whose network is given its observations in the body frame."""
-    scale = np.repeat([1.0, 0.8, 0.5, 0.3], [9, 3, 3, 3])
+    scale = np.concatenate([np.repeat([1.0, 0.8, 0.5, 0.3], [9, 3, 3, 3]), np.repeat([0.4, 0.6], 3)])[: frame.measured]
     (weight, bias), *others = base.layers
-    return replace(base, body_frame=True, observation_scale=scale, layers=((weight[6:], bias), *others))
+    rows = np.concatenate([weight[: 3 * frame.heading], weight[6:]])
+    return replace(base, body_frame=frame, observation_scale=scale, layers=((rows, bias), *others))
 
 
 @cache
 def remembering(which: str = "both", activation: str = "relu") -> Policy:
     """A lively policy with memory: each of its inputs moves the actions."""
     sizes, memory = REMEMBERING[which]
-    base = policy(sizes, activation)
-    if which == "circle":
-        base = in_body_frame(base)
+    base, frame = policy(sizes, activation), FRAMES.get(which)
+    if frame:
+        base = in_body_frame(base, frame)
     actions, n = len(base.actions), len(base.calibration)
     rng = np.random.default_rng([7, *sizes])
     columns, offset, gain = [base.calibration], [base.observation_offset], [base.observation_gain]
@@ -150,11 +167,11 @@ def remembering(which: str = "both", activation: str = "relu") -> Policy:
         offset.append(np.zeros(memory.integral.size))
         gain.append(np.full(memory.integral.size, 2.0 / memory.integral.limit_m_s))
     (weight, bias), *hidden, (last, last_bias) = base.layers
-    rows = memory.size(actions) + (which == "circle")
+    rows = memory.size(actions) + (frame.added if frame else 0)
     more = rng.normal(size=(rows, weight.shape[1])) * 0.5 * (2.0 / len(weight)) ** 0.5
     scale = rng.uniform(0.5, 1.0, memory.size(actions))
-    if which == "circle":
-        scale[-2:] = 0.7  # a vector: the same along x and y
+    if frame and frame.last:
+        scale[-frame.last :] = 0.7  # a vector: the same along its axes
     made = replace(
         base,
         memory=memory,
@@ -175,15 +192,25 @@ def remembering_kernel(which: str = "both", activation: str = "relu") -> Kernel:
     return quantize(remembering(which, activation))
 
 
+def literal_view(row: np.ndarray, heading: bool, vectors: int, last: int) -> list[float]:
+    """What a network is given of inputs [I] in the body frame."""
+    to_body = row[:9].reshape(3, 3).T
+    found = [*(to_body @ [1.0, 0.0, 0.0]), *(to_body @ [0.0, 0.0, 1.0])][0 if heading else 3 :]
+    found += [*(to_body @ row[9:12]), *(to_body @ row[12:15]), *row[15:18]]
+    for k in range(vectors):
+        found += [*(to_body @ row[18 + 3 * k : 21 + 3 * k])]
+    rest = row[18 + 3 * vectors :]
+    if not last:
+        return [*found, *rest]
+    return [*found, *rest[:-last], *(to_body[:, :last] @ rest[-last:])]
+
+
 def outputs(policy: Policy, inputs: np.ndarray) -> np.ndarray:
     """The network's own outputs [n, A], written apart from Policy."""
     x = (inputs.astype(np.float64) - policy.observation_offset) * policy.observation_gain
     x = np.minimum(np.maximum(x, -policy.observation_clip), policy.observation_clip) * policy.observation_scale
-    if policy.body_frame:
-        to_body = [row[:9].reshape(3, 3).T for row in x]
-        turned = [[*row[6:9], *(m @ row[9:12]), *(m @ row[12:15])] for m, row in zip(to_body, x, strict=True)]
-        rest = [[*row[15:-2], *(m @ [row[-2], row[-1], 0.0])] for m, row in zip(to_body, x, strict=True)]
-        x = np.concatenate([turned, rest], axis=1)
+    if frame := policy.body_frame:
+        x = np.array([literal_view(row, *astuple(frame)) for row in x])
     for i, (weight, bias) in enumerate(policy.layers):
         x = np.einsum("ni,io->no", x, weight) + bias
         if i < len(policy.layers) - 1:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from qrl_envs.controllers.mixer import action, mixer
-from qrl_envs.task import CircleReward, HoverReward, QuadrotorTask
+from qrl_envs.task import CircleReward, HoverReward, QuadrotorTask, TrackReward
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2
 
 TINY = 1e-6
@@ -39,18 +39,22 @@ class Gains(NamedTuple):
 
 
 def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Array], chex.Array]:  # noqa: B008
-    """The controller of a task's training reward, hover or circle: observation [..., 18] -> action [..., 4] in [−1, 1].
+    """The controller of a task's training reward: observation [..., 18 or more] -> action [..., 4] in [−1, 1].
 
-    On the circle the heading is free; in hover body x is turned to world x.
+    On the circle the heading is free; else body x is turned to world x. To track it accelerates as the reference does on
+    average until the first time of the preview, if there is one.
     """
     vehicle, motors = task.vehicle, mixer(task.vehicle)
     inertia_kg_m2 = np.asarray(vehicle.inertia_kg_m2, np.float32)
     field = _velocity_field(task.reward)
+    ahead_s = task.preview_s[0] if task.preview_s else None
     gravity = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2], np.float32)
     max_accel_m_s2 = gains.acceleration_share * motors.lift_N / vehicle.mass_kg - STANDARD_GRAVITY_M_S2
     braking_rad_s2 = gains.angular_braking_share * motors.torque_N_m / inertia_kg_m2
 
-    def desired_force(position_m: chex.Array, velocity_m_s: chex.Array) -> chex.Array:
+    def desired_force(
+        position_m: chex.Array, velocity_m_s: chex.Array, reference_m_s2: chex.Array | float
+    ) -> chex.Array:
         """F_d per mass [3] [m/s²], world."""
         accel = _desired_acceleration(
             lambda p: field(p, gains.position_1_s, gains.braking_share * max_accel_m_s2),
@@ -59,6 +63,7 @@ def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Ar
             gains.velocity_1_s,
             task.control_period_s,
         )
+        accel = accel + reference_m_s2
         limited = accel * jnp.minimum(1.0, max_accel_m_s2 / jnp.maximum(_norm(accel), TINY))
         force: chex.Array = jnp.asarray(gravity) + limited
         return force.at[2].max(gains.upward_share * STANDARD_GRAVITY_M_S2)
@@ -66,14 +71,19 @@ def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Ar
     def control(observation: chex.Array) -> chex.Array:
         R = observation[:9].reshape(3, 3)
         position, velocity, Omega = observation[9:12], observation[12:15], observation[15:18]
+        followed = 0.0 if ahead_s is None else observation[18:21] / ahead_s
+
+        def desired(position_m: chex.Array, velocity_m_s: chex.Array) -> chex.Array:
+            return desired_force(position_m, velocity_m_s, followed)
+
         b_3 = R[:, 2]
-        lift = jnp.clip(jnp.dot(desired_force(position, velocity), b_3), 0.0, motors.lift_N / vehicle.mass_kg)
-        F_d, jerk = jax.jvp(desired_force, (position, velocity), (velocity, lift * b_3 - gravity))
+        lift = jnp.clip(jnp.dot(desired(position, velocity), b_3), 0.0, motors.lift_N / vehicle.mass_kg)
+        F_d, jerk = jax.jvp(desired, (position, velocity), (velocity, lift * b_3 - gravity))
         b_3d = F_d / _norm(F_d)
         Omega_d = R.T @ jnp.cross(b_3d, jerk) / _norm(F_d) * jnp.array([1.0, 1.0, 0.0])  # of b_3d [rad/s], body
         max_feedforward = jnp.min(braking_rad_s2[:2]) / gains.tilt_1_s
         Omega_d *= jnp.minimum(1.0, max_feedforward / jnp.maximum(_norm(Omega_d), TINY))
-        feedback = _rate_feedback(R, b_3d, isinstance(task.reward, HoverReward), gains, braking_rad_s2)
+        feedback = _rate_feedback(R, b_3d, not isinstance(task.reward, CircleReward), gains, braking_rad_s2)
         e_Omega = Omega - (feedback + Omega_d)
         k_Omega = jnp.array([gains.rate_1_s, gains.rate_1_s, gains.heading_rate_1_s])
         M: chex.Array = jnp.asarray(inertia_kg_m2) * (-k_Omega * e_Omega) + jnp.cross(Omega, inertia_kg_m2 * Omega)
@@ -83,9 +93,11 @@ def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Ar
     return jnp.vectorize(control, signature="(n)->(m)")
 
 
-def _velocity_field(reward: HoverReward | CircleReward) -> Callable[[chex.Array, float, float], chex.Array]:
+def _velocity_field(
+    reward: HoverReward | CircleReward | TrackReward,
+) -> Callable[[chex.Array, float, float], chex.Array]:
     """The desired velocity [3] [m/s] at a position [3] [m], for a bandwidth [1/s] and a deceleration [m/s²]."""
-    if isinstance(reward, HoverReward):
+    if not isinstance(reward, CircleReward):
         return lambda position, bandwidth, braking: -position * _speed_per_distance(_norm(position), bandwidth, braking)
 
     def circle(position: chex.Array, bandwidth: float, braking: float) -> chex.Array:

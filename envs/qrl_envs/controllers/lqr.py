@@ -54,7 +54,7 @@ class LinearModel(NamedTuple):
 
 
 def controller(task: QuadrotorTask) -> Callable[[chex.Array], chex.Array]:
-    """The regulator of a task's training reward, hover or circle: observation [..., 18] -> action [..., 4] in [−1, 1].
+    """The regulator of a task's training reward: observation [..., 18 or more] -> action [..., 4] in [−1, 1].
 
     Raises NumPy's LinAlgError if the motors cannot stabilize the vehicle.
     """
@@ -85,13 +85,13 @@ def gain(model: LinearModel, q: np.ndarray, r: np.ndarray) -> np.ndarray:
 def weights(task: QuadrotorTask) -> tuple[np.ndarray, np.ndarray]:
     """The weights q [n, n] of the error and r [4, 4] of the action."""
     reward, far_m = task.evaluation.reward, max(task.evaluation.start.position_m, task.evaluation.distance_m)
-    if isinstance(reward, HoverReward):
-        position, axes = reward.w2_position_1_m, 3
-    else:
+    if isinstance(reward, CircleReward):
         position, axes = reward.w4_distance_1_m, 2  # radius and height
+    else:
+        position, axes = reward.w2_position_1_m if isinstance(reward, HoverReward) else reward.w_position_1_m, 3
     half_turn = position * far_m**2 / np.pi**2
     q = np.diag([position] * axes + [0.0] * 3 + [half_turn] * 3 + [0.0] * 3)
-    if not isinstance(reward, HoverReward):
+    if isinstance(reward, CircleReward):
         chi = np.zeros(len(q))  # gradient of x·vy − y·vx: by the radius, and by the velocity along the circle
         chi[0], chi[3] = reward.speed_m_s, reward.radius_m
         q += reward.w5_direction_s_m2 * np.outer(chi, chi)

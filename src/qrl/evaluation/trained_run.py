@@ -23,7 +23,7 @@ from qrl.algorithm.types import Env, State
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import calibration_starts
-from qrl.export.policy import WORLD_SIZE, ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import ActionSpec, BodyFrame, Integral, Memory, ObservationSpec, Policy, Provenance
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
@@ -151,12 +151,13 @@ class TrainedRun:
         memory = memory or self._memory()
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
         layers = deployed.params.policy["params"]
-        body_frame = isinstance(self.task, QuadrotorTask) and self.task.policy_frame == "body"
+        view = getattr(self.env, "body_view", None)
+        body_frame = BodyFrame(*view) if view else None
         normalize = config.normalize_observations
         observations, actions = self._specs()
         size = len(layers["Dense_0"]["kernel"])  # of what the policy sees
         if body_frame:
-            size = WORLD_SIZE + (memory.size(len(actions)) if memory else 0)
+            size = body_frame.measured + (memory.size(len(actions)) if memory else 0)
         mean = np.asarray(deployed.statistics.mean)[:size] if normalize else np.zeros(size)
         gain = 1.0 / np.asarray(std(deployed.statistics))[:size] if normalize else np.ones(size)
         offset_si, scale_si = _units(actions, size, memory)

@@ -67,7 +67,9 @@ def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
     """manifest.json: ports with names, units, frames, ranges and steps, memory, and where the policy comes from."""
     run = policy.provenance
     obs = [
-        {"name": o.name, "unit": o.unit, "frame": o.frame, "range": limits, "steps": [int(low), int(high)], "lsb": lsb}
+        {"name": o.name, "unit": o.unit, "frame": o.frame}
+        | ({} if o.ahead_s is None else {"ahead_s": o.ahead_s})
+        | {"range": limits, "steps": [int(low), int(high)], "lsb": lsb}
         for o, limits, low, high, lsb in zip(
             policy.observations, _obs_ranges(kernel), kernel.obs_min, kernel.obs_max, kernel.lsb.tolist(), strict=True
         )
@@ -240,8 +242,10 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         if memory.integral:
             parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
     if turn := kernel.turn:
-        shifts = zip(("UP", "POSITION", "VELOCITY"), (turn.up, turn.position, turn.velocity), strict=True)
-        parts.append("\n".join(f"#define {name}_SHIFT {shift}" for name, shift in shifts))
+        shifts = {"UP": turn.up, "POSITION": turn.position, "VELOCITY": turn.velocity, "AHEAD": turn.ahead}
+        numbers = {"HEADING": int(turn.heading), "VECTORS": turn.vectors, "LAST": turn.last}
+        numbers |= {f"{name}_SHIFT": shift for name, shift in shifts.items()}
+        parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
     parts += [_layer_tables(i, layer) for i, layer in enumerate(kernel.layers)]
     rows = (
         f"{{weights_{i}.w, biases_{i}, factors_{i}, {sizes[i]}, {sizes[i + 1]},"

@@ -75,15 +75,19 @@ class Memory:
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """The first inputs [12] of a network in the body frame, of a vehicle's 18 measurements x: ⌊x_i / 2^up⌉ of the third
-    row of the rotation matrix; ⌊Σ_i ⌊r_ij·p_i / 2⌋ / 2^position⌉ of the position, likewise of the velocity, each within
-    ±32767; the body rates. At the end, where the integral has a horizontal vector I, ⌊Σ_i ⌊r_ij·I_i / 2⌋ / 2¹⁵⌉ for its
-    inputs I.
+    """The first inputs of a network in the body frame, of a vehicle's measurements x: ⌊x_i / 2^up⌉ of the first row of
+    the rotation matrix, if `heading`, and of the third; ⌊Σ_i ⌊r_ij·p_i / 2⌋ / 2^position⌉ of the position, likewise of
+    the velocity, each within ±32767; the body rates; likewise the vectors that follow, by 2^ahead. At the end
+    ⌊Σ_i ⌊r_ij·I_i / 2⌋ / 2¹⁵⌉ for the last inputs I, where these are a vector.
     """
 
+    heading: bool
+    vectors: int  # how many follow the 18 measurements
+    last: int  # numbers of the vector at the end: 3, or 2 of a horizontal one; 0: there is none
     up: int  # in [0, 15]
     position: int  # in [15, 29]
     velocity: int  # in [15, 29]
+    ahead: int  # in [15, 29]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,25 +127,20 @@ class Kernel:
         return np.concatenate(parts) * 2.0**self.memory.shift
 
     @property
-    def rotates_integral(self) -> bool:
-        """Whether the integral's last two components are a horizontal vector, which is rotated into the body frame."""
-        integral = self.memory and self.memory.integral
-        return self.turn is not None and integral is not None and integral.circle is not None
-
-    @property
     def input_limits(self) -> tuple[Ints, Ints]:
         """Smallest and largest of each of the network's inputs."""
         low, high = (shifted(limit, self.obs_shift) for limit in (self.obs_min, self.obs_max))
-        if self.turn:
-            full = np.full(6, INT16)
-            low = np.concatenate([shifted(low[6:9], self.turn.up), -full, low[15:]])
-            high = np.concatenate([shifted(high[6:9], self.turn.up), full, high[15:]])
+        if turn := self.turn:
+            full, more = np.full(6, INT16), np.full(3 * turn.vectors, INT16)
+            axes = [slice(0, 3 * turn.heading), slice(6, 9)]
+            low = np.concatenate([*(shifted(low[a], turn.up) for a in axes), -full, low[15:18], -more])
+            high = np.concatenate([*(shifted(high[a], turn.up) for a in axes), full, high[15:18], more])
         if self.memory is None:
             return low, high
         low, high = np.concatenate([low, self.memory.low]), np.concatenate([high, self.memory.high])
-        if self.rotates_integral:
+        if self.turn and (last := self.turn.last):
             full = np.full(3, INT16)
-            low, high = np.concatenate([low[:-2], -full]), np.concatenate([high[:-2], full])
+            low, high = np.concatenate([low[:-last], -full]), np.concatenate([high[:-last], full])
         return low, high
 
     @property
@@ -180,7 +179,7 @@ def _check_fields(kernel: Kernel) -> None:
     if turn := kernel.turn:
         ranges += [
             ("an input's shift", np.array(turn.up), 0, 15),
-            ("an input's shift", np.array([turn.position, turn.velocity]), 15, 29),
+            ("an input's shift", np.array([turn.position, turn.velocity, turn.ahead]), 15, 29),
         ]
     if memory := kernel.memory:
         ranges += [
@@ -297,11 +296,15 @@ def measured(kernel: Kernel, x: Ints) -> Ints:
         return shifted(x, kernel.obs_shift)
     rotation = x[:, :9].reshape(-1, 3, 3)
 
-    def rotated(vector: Ints, shift: int) -> Ints:
-        return np.clip(shifted((rotation * vector[:, :, None] >> 1).sum(axis=1), shift), -INT16, INT16)
+    def rotated(at: int, shift: int) -> Ints:
+        vector = x[:, at : at + 3, None]
+        return np.clip(shifted((rotation * vector >> 1).sum(axis=1), shift), -INT16, INT16)
 
-    position, velocity = rotated(x[:, 9:12], turn.position), rotated(x[:, 12:15], turn.velocity)
-    return np.concatenate([shifted(x[:, 6:9], turn.up), position, velocity, x[:, 15:]], axis=-1)
+    axes = [shifted(x[:, : 3 * turn.heading], turn.up), shifted(x[:, 6:9], turn.up)]
+    vectors = [rotated(at, turn.ahead) for at in range(18, 18 + 3 * turn.vectors, 3)]
+    return np.concatenate(
+        [*axes, rotated(9, turn.position), rotated(12, turn.velocity), x[:, 15:18], *vectors], axis=-1
+    )
 
 
 def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
@@ -315,11 +318,11 @@ def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
 
 def remembered(kernel: Kernel, kept: Ints, x: Ints) -> Ints:
     """The network's last inputs, for those of the memory [n, M] and saturated observations x [n, F]."""
-    if not kernel.rotates_integral:
+    if kernel.turn is None or not (last := kernel.turn.last):
         return kept
-    rotation = x[:, :6].reshape(-1, 2, 3)
-    vector = shifted((rotation * kept[:, -2:, None] >> 1).sum(axis=1), 15)
-    return np.concatenate([kept[:, :-2], vector], axis=-1)
+    rotation = x[:, : 3 * last].reshape(-1, last, 3)
+    vector = np.clip(shifted((rotation * kept[:, -last:, None] >> 1).sum(axis=1), 15), -INT16, INT16)
+    return np.concatenate([kept[:, :-last], vector], axis=-1)
 
 
 def _act(kernel: Kernel, state: Ints, x: Ints) -> tuple[Ints, Ints]:

@@ -14,6 +14,7 @@ class ObservationSpec:
     name: str
     unit: str
     frame: str
+    ahead_s: float | None = None  # of the preview of a reference: how far ahead
 
 
 @dataclass(frozen=True)
@@ -97,21 +98,52 @@ class Memory:
         return actions * self.previous_action + (self.integral.size if self.integral else 0)
 
 
-WORLD_SIZE, BODY_SIZE = 18, 12  # numbers of a vehicle's measurements, and of these in the body frame
+WORLD_SIZE = 18  # numbers of a vehicle's measurements
 
 
-def in_body_frame(observation: NDArray[np.floating], horizontal: bool) -> NDArray[np.float64]:
-    """The observation's first 18 numbers as they are in the body frame, without the heading: the world's z axis [3],
-    position [3], velocity [3], body rates [3]; then what follows them, of which the last two, with `horizontal`, are a
-    vector along the world's x and y, and three in the body frame. [..., 18 + M] -> [..., 12 + M or 13 + M].
+@dataclass(frozen=True)
+class BodyFrame:
+    """What a network is given in the body frame, of inputs [I] that begin with a vehicle's 18 measurements: the world's
+    x axis [3], if `heading`, and its z axis [3], position [3], velocity [3], body rates [3]; the vectors of the world
+    that follow; then what is neither, and at the end the vector of the world that the last inputs are.
     """
-    o = np.asarray(observation, np.float64)
-    rotation = o[..., :9].reshape(*o.shape[:-1], 3, 3)
-    rotated = [np.einsum("...ij,...i->...j", rotation, o[..., at : at + 3]) for at in (9, 12)]
-    if not horizontal:
-        return np.concatenate([o[..., 6:9], *rotated, o[..., 15:]], axis=-1)
-    vector = np.einsum("...ij,...i->...j", rotation[..., :2, :], o[..., -2:])
-    return np.concatenate([o[..., 6:9], *rotated, o[..., 15:-2], vector], axis=-1)
+
+    heading: bool
+    vectors: int
+    last: int  # how many numbers the vector at the end has: 3, or 2 of a horizontal one; 0: there is none
+
+    @property
+    def measured(self) -> int:
+        """Numbers of the inputs that are measured."""
+        return WORLD_SIZE + 3 * self.vectors
+
+    @property
+    def size(self) -> int:
+        """Numbers of the network's input that follow from what is measured."""
+        return 12 + 3 * self.heading + 3 * self.vectors
+
+    @property
+    def added(self) -> int:
+        """How many numbers longer the rest becomes."""
+        return 3 - self.last if self.last else 0
+
+    def ordered(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of values [I], alike along the axes of a vector, one for each of the network's inputs."""
+        return np.concatenate([values[: 3 * self.heading], values[6:], np.repeat(values[-1:], self.added)])
+
+    def __call__(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The network's inputs for the inputs [..., I]."""
+        o = np.asarray(inputs, np.float64)
+        rotation = o[..., :9].reshape(*o.shape[:-1], 3, 3)
+
+        def rotated(at: int, numbers: int = 3) -> NDArray[np.float64]:
+            return np.einsum("...ij,...i->...j", rotation[..., :numbers, :], o[..., at : at + numbers])
+
+        end = o.shape[-1] - self.last
+        parts = [o[..., : 3 * self.heading], o[..., 6:9], rotated(9), rotated(12), o[..., 15:WORLD_SIZE]]
+        parts += [rotated(at) for at in range(WORLD_SIZE, self.measured, 3)]
+        parts += [o[..., self.measured : end], *([rotated(end, self.last)] if self.last else [])]
+        return np.concatenate(parts, axis=-1)
 
 
 Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outputs], bias [outputs]
@@ -121,8 +153,8 @@ Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outpu
 class Policy:
     """Deterministic policy in SI units: inputs [..., I] -> action [..., A].
 
-    The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds [M]; I = F + M. With
-    `body_frame` the network is given `in_body_frame` of them.
+    The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds [M]; I = F + M. With a
+    `body_frame` the network is given them in it.
     """
 
     provenance: Provenance
@@ -137,7 +169,7 @@ class Policy:
     activation: str  # of all layers but the last: "relu" or "tanh"
     calibration: NDArray[np.float32]  # [n, I] inputs of the policy's own flights
     memory: Memory | None = None
-    body_frame: bool = False
+    body_frame: BodyFrame | None = None
 
     def __call__(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
         """Action in SI units; [..., I] -> [..., A]. Of a policy without memory the inputs are the observation."""
@@ -149,23 +181,15 @@ class Policy:
         weight, bias = self.layers[-1]
         return self.to_si(x @ weight + bias)
 
-    @property
-    def rotates_integral(self) -> bool:
-        """Whether the integral's last two components are rotated into the body frame."""
-        integral = self.memory and self.memory.integral
-        return self.body_frame and integral is not None and integral.circle_m is not None
-
     def seen(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
         """What the network is given of inputs [..., I], scaled or not."""
-        return in_body_frame(inputs, self.rotates_integral) if self.body_frame else np.asarray(inputs, np.float64)
+        return self.body_frame(inputs) if self.body_frame else np.asarray(inputs, np.float64)
 
     @property
     def input_gain(self) -> NDArray[np.float64]:
         """The network's inputs over those in SI units; one for each row of its first layer."""
         gain = self.observation_gain * self.observation_scale
-        return (
-            np.concatenate([gain[6:], gain[-1:]] if self.rotates_integral else [gain[6:]]) if self.body_frame else gain
-        )
+        return self.body_frame.ordered(gain) if self.body_frame else gain
 
     @property
     def memory_size(self) -> int:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
-from qrl.export.policy import ACTIVATIONS, BODY_SIZE, WORLD_SIZE, Layer, Policy
+from qrl.export.policy import ACTIVATIONS, BodyFrame, Layer, Policy
 
 Floats = NDArray[np.float64]
 
@@ -71,33 +71,17 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     low, high = policy.limits
     act_lsb = (np.maximum(np.abs(low), np.abs(high)) / INT16).astype(np.float32)
     act_min, act_max = (np.round(bound / act_lsb.astype(np.float64)).astype(np.int64) for bound in (low, high))
-    remembered = _memory_lsb(policy, act_lsb) * INT16
     ranges = _ranges(inputs[:, :measured], policy.body_frame)
-    seen = _ranges(x_float[:, :BODY_SIZE], same_axes=False) if policy.body_frame else ranges
-    last = np.append(remembered, remembered[-1]) if policy.rotates_integral else remembered
-    wanted = _steps(np.concatenate([seen, last]), layers[0][0], MIN_LEVELS)
-    if policy.rotates_integral:
-        wanted = np.append(wanted[:-3], [wanted[-3:].min()] * 2)
-    # What is integrated, remembered or rotated has the finest step; a coarser one of the network's input is a shift.
-    shift = np.floor(np.log2(wanted / (np.concatenate([seen, remembered]) / INT16)) + 1e-9).astype(np.int64)
-    remembered_shift, seen_shift = shift[len(seen) :], shift[: len(seen)]
-    finest = ranges / INT16
-    if policy.body_frame:
-        steps = np.concatenate([finest[:15], wanted[9:12]])
-        obs_shift = np.zeros(measured, np.int64)
-    else:
-        integral = policy.memory and policy.memory.integral
-        integrated = np.isin(np.arange(measured), integral.position if integral else ())
-        steps, obs_shift = np.where(integrated, finest, wanted[:measured]), np.where(integrated, seen_shift, 0)
+    wanted, obs_shift, remembered_shift, steps = _input_steps(policy, layers[0][0], x_float, ranges, act_lsb)
     scale, exponent = _as_scale(steps)
     lsb = 2.0 ** (exponent - 142) / scale
     most = np.minimum(np.floor(ranges / lsb), INT16)
     first_step, turn = lsb * 2.0**obs_shift, None
-    if policy.body_frame:
-        turn, first_step = _turn(lsb, wanted)
-    last_step = remembered / INT16 * 2.0**remembered_shift
-    if policy.rotates_integral:
-        last_step = np.concatenate([last_step[:-2], np.full(3, 2.0**16 * lsb[0] * last_step[-1])])
+    last_step = _memory_lsb(policy, act_lsb) * 2.0**remembered_shift
+    if frame := policy.body_frame:
+        turn, first_step = _turn(frame, lsb, wanted)
+        if frame.last:
+            last_step = np.concatenate([last_step[: -frame.last], np.full(3, 2.0**16 * lsb[0] * last_step[-1])])
     step = np.concatenate([first_step, last_step])
     kernel = Kernel(
         scale=scale,
@@ -143,24 +127,60 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     return kernel
 
 
-def _ranges(x: Floats, same_axes: bool) -> Floats:
-    """Range of each observation [n, F], or, with `same_axes`, of a vehicle's rotation, position and velocity each."""
+def _input_steps(
+    policy: Policy, weight: Floats, x_float: Floats, ranges: Floats, act_lsb: NDArray[np.float32]
+) -> tuple[Floats, Ints, Ints, Floats]:
+    """The steps wanted of the network's inputs, the shifts of the observations [F] and of the memory's inputs [M] to
+    them, and the steps [F] of the observations; `ranges` [F], and `x_float` [n, inputs] in SI units.
+
+    What is integrated, remembered or rotated has the finest step; a coarser one of the network's input is a shift.
+    """
+    remembered = _memory_lsb(policy, act_lsb) * INT16
+    finest, measured, frame = ranges / INT16, len(ranges), policy.body_frame
+    if frame is None:
+        wanted = _steps(np.concatenate([ranges, remembered]), weight, MIN_LEVELS)
+        shift = _shift(wanted, np.concatenate([finest, remembered / INT16]))
+        integral = policy.memory and policy.memory.integral
+        integrated = np.isin(np.arange(measured), integral.position if integral else ())
+        steps = np.where(integrated, finest, wanted[:measured])
+        return wanted, np.where(integrated, shift[:measured], 0), shift[measured:], steps
+    seen = _ranges(x_float[:, : frame.size], None)
+    wanted = _steps(np.concatenate([seen, remembered, np.repeat(remembered[-1:], frame.added)]), weight, MIN_LEVELS)
+    own = wanted[frame.size : frame.size + len(remembered)].copy()
+    if frame.last:
+        own[-frame.last :] = wanted[-3:].min()
+    rates = slice(frame.size - 3 * frame.vectors - 3, frame.size - 3 * frame.vectors)
+    steps = np.concatenate([finest[:15], wanted[rates], finest[18:]])
+    return wanted, np.zeros(measured, np.int64), _shift(own, remembered / INT16), steps
+
+
+def _shift(wanted: Floats, finest: Floats) -> Ints:
+    return np.floor(np.log2(wanted / finest) + 1e-9).astype(np.int64)
+
+
+def _ranges(x: Floats, frame: BodyFrame | None) -> Floats:
+    """Range of each observation [n, F]; with a `frame`, of a vehicle's rotation and of each vector's axes alike."""
     largest = np.abs(x).max(axis=0)
-    if same_axes:
-        for part in (slice(0, 9), slice(9, 12), slice(12, 15)):
-            largest[part] = largest[part].max()
+    if frame:
+        for part in (slice(0, 9), slice(9, 12), slice(12, 15), slice(18, None)):
+            largest[part] = largest[part].max(initial=0.0)
     return RANGE_MARGIN * np.where(largest > 0.0, largest, MIN_INPUT)
 
 
-def _turn(lsb: Floats, wanted: Floats) -> tuple[integers.Turn, Floats]:
-    """The shifts into the body frame, and the steps [12] of the network's inputs, at most those wanted where the
+def _turn(frame: BodyFrame, lsb: Floats, wanted: Floats) -> tuple[integers.Turn, Floats]:
+    """The shifts into the body frame, and the steps of the network's first inputs, at most those wanted where the
     products allow it.
     """
-    finest = np.array([lsb[6], 2.0 * lsb[0] * lsb[9], 2.0 * lsb[0] * lsb[12]])
-    groups = np.array([wanted[at : at + 3].min() for at in (0, 3, 6)])
-    up, position, velocity = (int(x) for x in np.clip(np.floor(np.log2(groups / finest)), [0, 15, 15], [15, 29, 29]))
-    steps = finest * 2.0 ** np.array([up, position, velocity])
-    return integers.Turn(up, position, velocity), np.concatenate([np.repeat(steps, 3), lsb[15:]])
+    axes = 3 + 3 * frame.heading
+    ahead = slice(axes + 9, frame.size)
+    groups = [wanted[:axes], wanted[axes : axes + 3], wanted[axes + 3 : axes + 6], wanted[ahead]]
+    finest = [lsb[6], *(2.0 * lsb[0] * lsb[at] for at in (9, 12, 18 if frame.vectors else 12))]
+    shifts, steps = [], []
+    for group, fine, (least, most) in zip(groups, finest, [(0, 15), *[(15, 29)] * 3], strict=True):
+        shifts.append(int(np.clip(np.floor(np.log2(group.min(initial=1e30) / fine)), least, most)))
+        steps.append(np.full(len(group), fine * 2.0 ** shifts[-1]))
+    turn = integers.Turn(frame.heading, frame.vectors, frame.last, *shifts)
+    return turn, np.concatenate([*steps[:3], lsb[15:18], steps[3]])
 
 
 def respond(kernel: Kernel, x: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -259,10 +279,12 @@ def _check(policy: Policy) -> None:
     if policy.memory and not policy.memory_size:
         raise UnsupportedNetwork("a memory that holds nothing")
     expected = len(policy.observations) + policy.memory_size
-    if policy.body_frame:
-        expected += BODY_SIZE - WORLD_SIZE + policy.rotates_integral
-        if len(policy.observations) != WORLD_SIZE or np.any(policy.observation_offset[:WORLD_SIZE]):
-            raise UnsupportedNetwork("the body frame: expected a vehicle's 18 observations, not standardized")
+    if frame := policy.body_frame:
+        expected = frame.size + policy.memory_size + frame.added
+        if len(policy.observations) != frame.measured or np.any(policy.observation_offset[: frame.measured]):
+            raise UnsupportedNetwork(
+                f"the body frame: expected {frame.measured} observations of a vehicle, not standardized"
+            )
     if len(policy.layers[0][0]) != expected:
         raise UnsupportedNetwork(f"layer 0: expected {expected} inputs, found {len(policy.layers[0][0])}")
     if not np.isfinite(policy.calibration).all() or not len(policy.calibration):
@@ -276,7 +298,7 @@ def si_layers(policy: Policy) -> list[Layer]:
     weight = weight * policy.input_gain[:, None]
     offset = policy.observation_offset
     if policy.body_frame:
-        offset = np.append(offset[WORLD_SIZE - BODY_SIZE :], [0.0] * policy.rotates_integral)
+        offset = policy.body_frame.ordered(offset)
     layers[0] = weight, bias - offset @ weight
     weight, bias = layers[-1]
     layers[-1] = weight * policy.scale, bias * policy.scale + policy.offset

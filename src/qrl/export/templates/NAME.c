@@ -413,19 +413,26 @@ static void rotated(activation y[3], const int32_t r[9], const activation v[], i
     }
 }
 
-/* The observation, rotation matrix, position, velocity and body rates, as it is in the body frame, without heading. */
+/* The observation as it is in the body frame: of the rotation matrix the first row, if the heading matters, and the
+   third; position, velocity, body rates, and the vectors that follow. */
 static void turn(union activations *x, int32_t r[9]) {
+    activation *to = x->one;
     for (int i = 0; i < 9; ++i) {
         r[i] = (int32_t)x->one[i] - OFFSET;
     }
+    for (int i = HEADING ? 0 : 6; i < 9; i += i == 2 ? 4 : 1) {
+        *to++ = (activation)(shifted(r[i], UP_SHIFT) + OFFSET);
+    }
+    rotated(to, r, x->one + 9, 3, POSITION_SHIFT);
+    rotated(to + 3, r, x->one + 12, 3, VELOCITY_SHIFT);
     for (int i = 0; i < 3; ++i) {
-        x->one[i] = (activation)(shifted(r[6 + i], UP_SHIFT) + OFFSET);
+        to[6 + i] = x->one[15 + i];
     }
-    rotated(x->one + 3, r, x->one + 9, 3, POSITION_SHIFT);
-    rotated(x->one + 6, r, x->one + 12, 3, VELOCITY_SHIFT);
-    for (int i = 9; i < 12; ++i) {
-        x->one[i] = x->one[i + 6];
+#if VECTORS
+    for (int i = 0; i < 3 * VECTORS; i += 3) {
+        rotated(to + 9 + i, r, x->one + 18 + i, 3, AHEAD_SHIFT);
     }
+#endif
 }
 
 #endif
@@ -452,10 +459,13 @@ static void complete(union activations *x, @name@_state *state) {
 #endif
         x->one[i] = (activation)(limited(shifted(value, k->shift), k->least, k->most) + OFFSET);
     }
-#if TURN && defined(CIRCLE) /* the last two are a horizontal vector */
-    const activation horizontal[2] = {x->one[i - 2], x->one[i - 1]};
-    rotated(x->one + i - 2, r, horizontal, 2, 15);
-    ++i;
+#if TURN && LAST /* the last are a vector, of two numbers if it is horizontal */
+    activation last[LAST];
+    for (int k = 0; k < LAST; ++k) {
+        last[k] = x->one[i - LAST + k];
+    }
+    rotated(x->one + i - LAST, r, last, LAST, 15);
+    i += 3 - LAST;
 #endif
 #else
     (void)state;
