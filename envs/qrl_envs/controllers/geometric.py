@@ -41,8 +41,8 @@ class Gains(NamedTuple):
 def controller(task: QuadrotorTask, gains: Gains = Gains()) -> Callable[[chex.Array], chex.Array]:  # noqa: B008
     """The controller of a task's training reward: observation [..., 18 or more] -> action [..., 4] in [−1, 1].
 
-    On the circle the heading is free; else body x is turned to world x. To track it accelerates as the reference does on
-    average until the first time of the preview, if there is one.
+    On the circle the heading is free; else body x is turned to world x. To track it accelerates as the reference does
+    on average until the first time of the preview, if there is one.
     """
     vehicle, motors = task.vehicle, mixer(task.vehicle)
     inertia_kg_m2 = np.asarray(vehicle.inertia_kg_m2, np.float32)
