@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from qrl_envs import measures, pendulum, plant, quadrotor, rewards, symmetry
+from qrl_envs import distribution, measures, pendulum, plant, quadrotor, rewards, symmetry
 from qrl_envs import task as tasks
 from qrl_envs.reference import Random, Reference
 from qrl_envs.symmetry import Symmetry
@@ -322,11 +322,15 @@ class RealQuadrotorEnv(QuadrotorEnv):
     def _draw(self, params: Any, rng: chex.PRNGKey) -> plant.Flight:
         # The start's key is that of the ideal world: the same starts, whatever the plant.
         draws, others = plant.DRAWS + self.action_size, self._reference.draws if self._reference else 0
-        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (draws + others,))
-        world, body, origin_m = plant.draw(params.ranges, params.physics, u[:draws]), self._start(params, rng), 0.0
+        vehicles, own = self.task.distribution, None
+        count = draws + others + (distribution.DRAWS if vehicles else 0)
+        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (count,))
+        if vehicles:
+            own = distribution.draw(vehicles, params.physics, self.task.vehicle, u[draws + others :])
+        world, body, origin_m = plant.draw(params.ranges, params.physics, u[:draws], own), self._start(params, rng), 0.0
         if self._reference:
             thrust = jnp.sum(world.motor_factor * world.physics.motor_max_N)
-            world = world._replace(reference=self._reference.draw(u[draws:], world.physics, thrust))
+            world = world._replace(reference=self._reference.draw(u[draws : draws + others], world.physics, thrust))
             target = self._reference.at(world.reference, jnp.int32(0))
             origin_m = target.position_m
             body = plant.relative(body, jax.tree.map(jnp.negative, target))
@@ -337,13 +341,16 @@ class RealQuadrotorEnv(QuadrotorEnv):
         x = x._replace(world=jax.lax.stop_gradient(world))
         target = self._target(x.world, x.steps + 1)
         origin_m = 0.0 if target is None else target.position_m
-        flight = plant.step(x, action, self._integrator, self.task.control_period_s, origin_m)._replace(world=world)
+        rotor_speed = self.task.action == "rotor_speed"
+        flight = plant.step(x, action, self._integrator, self.task.control_period_s, origin_m, rotor_speed)
+        flight = flight._replace(world=world)
         body = flight.body if target is None else plant.relative(flight.body, target)
         return flight, params.reward(body, flight.previous_action, before)
 
     def _observe(self, params: Params, x: plant.Flight) -> chex.Array:
         seen = plant.observe(x, self.task.memory.previous_action, self._target(x.world, x.steps))
-        return jnp.concatenate([seen, plant.privileged(x, params.physics, self.task.control_period_s)])
+        own = self.task.distribution is not None
+        return jnp.concatenate([seen, plant.privileged(x, params.physics, self.task.control_period_s, own)])
 
     def _out_of_bounds(self, params: Params, x: plant.Flight) -> chex.Array:
         return super()._out_of_bounds(params, self._error(x))

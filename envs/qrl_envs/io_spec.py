@@ -27,6 +27,7 @@ class ActionPort(NamedTuple):
     safe: float  # command when an input is invalid: hover thrust, zero torque
     position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
+    quantity: str | None = None  # where `unit` does not say it
 
 
 def observations(task: Task) -> list[ObservationPort]:
@@ -71,6 +72,23 @@ def actions(task: Task) -> list[ActionPort]:
         limit, frame = task.rod.max_torque_N_m, "about the pivot, positive counter-clockwise"
         return [ActionPort("torque", "N m", frame, offset=0.0, scale=limit, low=-limit, high=limit, safe=0.0)]
     vehicle = task.vehicle
+    if task.action == "rotor_speed":
+        return [
+            ActionPort(
+                name=f"f{i}",
+                unit="1",
+                frame="rotor speed, of its greatest",
+                offset=0.5,
+                scale=0.5,
+                low=0.0,
+                high=1.0,
+                safe=round(float(speed), 4),
+                position_m=motor.position_m,
+                spin=motor.spin,
+                quantity="rotor speed fraction",
+            )
+            for i, (motor, speed) in enumerate(zip(vehicle.motors, vehicle.hover_speeds, strict=True), 1)
+        ]
     hover = [float(thrust) for thrust in vehicle.hover_thrusts_N]
     return [
         ActionPort(

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from qrl_envs import integrate, quadrotor, rotation, rotors
+from qrl_envs.distribution import Drawn
 from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
 from qrl_envs.rotors import Rotors
 from qrl_envs.target import Target
@@ -97,8 +98,8 @@ def _direction(u: chex.Array) -> chex.Array:
     return jnp.stack([across * jnp.cos(angle), across * jnp.sin(angle), z])
 
 
-def draw(ranges: Ranges, physics: Physics, u: chex.Array) -> World:
-    """The world of a flight, from u [DRAWS + N] uniform in [0, 1).
+def draw(ranges: Ranges, physics: Physics, u: chex.Array, own: Drawn | None = None) -> World:
+    """The world of a flight, from u [DRAWS + N] uniform in [0, 1); of the flight's `own` vehicle, if it has one.
 
     A vehicle whose thrust is then under LEAST_THRUST of its weight and the force on it, and under what the vehicle of
     the file has, is made lighter, and the force weaker.
@@ -107,23 +108,27 @@ def draw(ranges: Ranges, physics: Physics, u: chex.Array) -> World:
     def within(pair: chex.Array, u: chex.Array) -> chex.Array:
         return pair[0] + (pair[1] - pair[0]) * u
 
+    physics = physics if own is None else own.physics
+    drag_N_s_m = ranges.drag_N_s_m if own is None else own.drag_N_s_m
     motors = within(ranges.thrust_factor, u[0]) * within(ranges.motor_factor, u[DRAWS:])
     own_thrust = jnp.sum(physics.motor_max_N)
     own_weight_N = physics.mass_kg * physics.gravity_m_s2
     mass, force = within(ranges.mass_factor, u[1]), within(ranges.force_weights, u[2])
+    force = force if own is None else force + own.surplus_weights
     thrust = jnp.sum(motors * physics.motor_max_N) / own_weight_N
     share = jnp.minimum(1.0, thrust / (mass + force) / jnp.minimum(LEAST_THRUST, own_thrust / own_weight_N))
     mass, force = mass * share, force * share
     roll = jnp.min(jnp.sum(jnp.abs(physics.motor_torque_m[:2]), axis=1)) / 2.0 * jnp.mean(physics.hover_thrust_N)
     wind = 2.0 * jnp.pi * u[3]
+    lags = Rotors(within(ranges.rotor_rise_s, u[5]), within(ranges.rotor_fall_s, u[5]), ranges.thrust_curve)
     return World(
         physics=physics._replace(
             mass_kg=physics.mass_kg * mass, inertia_kg_m2=physics.inertia_kg_m2 * within(ranges.inertia_factor, u[4])
         ),
         motor_factor=motors,
-        rotors=Rotors(within(ranges.rotor_rise_s, u[5]), within(ranges.rotor_fall_s, u[5]), ranges.thrust_curve),
+        rotors=lags if own is None else own.rotors,
         disturbance=Disturbance(
-            drag_N_s_m=ranges.drag_N_s_m * within(ranges.drag_factor, u[6]),
+            drag_N_s_m=drag_N_s_m * within(ranges.drag_factor, u[6]),
             wind_m_s=within(ranges.wind_m_s, u[7]) * jnp.stack([jnp.cos(wind), jnp.sin(wind), jnp.zeros_like(wind)]),
             force_N=force * own_weight_N * _direction(u[8:10]),
             torque_N_m=within(ranges.torque_share, u[10]) * roll * _direction(u[11:13]),
@@ -213,11 +218,13 @@ def step(
     integrator: Integrator | None,
     dt_s: float,
     origin_m: chex.Array | float = 0.0,
+    rotor_speed: bool = False,
 ) -> Flight:
-    """One control period under `action` [N], after which the position's error is relative to `origin_m` [3]."""
+    """One control period under `action` [N], after which the position's error is relative to `origin_m` [3]. With
+    `rotor_speed` −1 to 1 stands for a speed from 0 to the greatest.
+    """
     world, physics = flight.world, flight.world.physics
-    thrust = quadrotor.thrust_N(physics, action)
-    set_point = rotors.speed_of(world.rotors.curve, thrust / physics.motor_max_N)
+    set_point, applied = commanded(world, action, rotor_speed)
     set_points = jnp.concatenate([set_point[None], flight.set_points[:-1]])
     # Set-point i acts from latency_s − i·dt_s on; before that, set-point i + 1.
     first = jnp.floor(world.latency_s / dt_s + 1e-4)
@@ -253,10 +260,21 @@ def step(
         set_points=set_points,
         world=world,
         sensed=sensed,
-        previous_action=quadrotor.applied_action(physics, thrust),
+        previous_action=applied,
         integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m - origin_m, integrator, dt_s),
         steps=steps,
     )
+
+
+def commanded(world: World, action: chex.Array, rotor_speed: bool) -> tuple[chex.Array, chex.Array]:
+    """The set-points of the rotors' speeds, and the action that stands for them; [N] each, for an action [N]."""
+    physics, curve = world.physics, world.rotors.curve
+    if not rotor_speed:
+        thrust = quadrotor.thrust_N(physics, action)
+        return rotors.speed_of(curve, thrust / physics.motor_max_N), quadrotor.applied_action(physics, thrust)
+    least = rotors.speed_of(curve, physics.motor_min_N / physics.motor_max_N)
+    set_point = jnp.clip(0.5 + 0.5 * action, least, 1.0)
+    return set_point, 2.0 * set_point - 1.0
 
 
 def _renormalized(body: Body) -> Body:
@@ -336,11 +354,16 @@ def _inertia(physics: Physics) -> chex.Array:
 PRIVILEGED = 14  # numbers of `privileged`, besides one for each motor
 
 
-def privileged(flight: Flight, nominal: Physics, dt_s: float) -> chex.Array:
+def privileged(flight: Flight, nominal: Physics, dt_s: float, own: bool = False) -> chex.Array:
     """What only a critic may see, about 1 in size: three numbers of force and of torque, six of the vehicle, latency,
-    drag; rotor speeds [N].
+    drag; rotor speeds [N]. With `own`, of a vehicle that may be far from the nominal one.
     """
     world = flight.world
+
+    def of(ratio: chex.Array) -> chex.Array:
+        return jnp.log(ratio) if own else 4.0 * (ratio - 1.0)
+
+    motors = world.motor_factor * world.physics.motor_max_N / nominal.motor_max_N if own else world.motor_factor
     weight_N = nominal.mass_kg * nominal.gravity_m_s2
     drag = jnp.mean(world.disturbance.drag_N_s_m, axis=0)
     push = world.disturbance.force_N + drag * world.disturbance.wind_m_s
@@ -349,9 +372,9 @@ def privileged(flight: Flight, nominal: Physics, dt_s: float) -> chex.Array:
     )
     factors = jnp.stack(
         [
-            4.0 * (world.physics.mass_kg / nominal.mass_kg - 1.0),
-            4.0 * (jnp.mean(world.motor_factor, axis=0) - 1.0),
-            4.0 * (_inertia(world.physics) / _inertia(nominal) - 1.0),
+            of(world.physics.mass_kg / nominal.mass_kg),
+            of(jnp.mean(motors, axis=0)),
+            of(_inertia(world.physics) / _inertia(nominal)),
             10.0 * world.rotors.rise_s,
             10.0 * world.rotors.fall_s,
             world.latency_s / dt_s,

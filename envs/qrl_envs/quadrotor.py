@@ -8,7 +8,6 @@ from typing import NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from qrl_envs import integrate, rotation
 from qrl_envs.task import FlightStart
@@ -57,13 +56,12 @@ class Start(NamedTuple):
 
 def physics(vehicle: Vehicle) -> Physics:
     """The parameters of a vehicle file."""
-    along_z = np.allclose(vehicle.motor_axes[:2], 0.0, atol=1e-9)
     principal = len(vehicle.inertia_kg_m2) == 3
     inertia = vehicle.inertia_kg_m2 if principal else vehicle.inertia_matrix_kg_m2
     return Physics(
         mass_kg=jnp.float32(vehicle.mass_kg),
         inertia_kg_m2=jnp.asarray(inertia, jnp.float32),
-        motor_axis=None if along_z else jnp.asarray(vehicle.motor_axes, jnp.float32),
+        motor_axis=None if vehicle.upright else jnp.asarray(vehicle.motor_axes, jnp.float32),
         motor_torque_m=jnp.asarray(vehicle.torques_m, jnp.float32),
         motor_min_N=jnp.asarray([m.min_N for m in vehicle.motors], jnp.float32),
         motor_max_N=jnp.asarray([m.max_N for m in vehicle.motors], jnp.float32),

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from qrl_envs import reference as references
 from qrl_envs import specfile
+from qrl_envs.distribution import VehicleDistribution, distribution_data, shipped_distributions
 from qrl_envs.reference import FixedReference, Reference, reference_data, shipped_references
 from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
 from qrl_envs.uncertainty import Uncertainty, shipped_uncertainties, uncertainty_data
@@ -154,6 +155,10 @@ class QuadrotorTask(Spec):
     episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
     uncertainty: Uncertainty | None = None
+    # Each flight has a vehicle of its own, with the places of the motors of `vehicle`. As `vehicle.Later`.
+    distribution: Annotated[VehicleDistribution | None, Field(exclude_if=lambda x: x is None)] = None
+    # What an action in [−1, 1] stands for: thrusts about hover, or the rotors' speeds from 0 to their greatest.
+    action: Annotated[Literal["thrust", "rotor_speed"], Field(exclude_if=lambda x: x == "thrust")] = "thrust"
     memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `vehicle.Later`
     # The frame of what a policy network is given: the world's, or the body's without the heading. As `vehicle.Later`.
     policy_frame: Annotated[Literal["world", "body"], Field(exclude_if=lambda x: x == "world")] = "world"
@@ -177,6 +182,7 @@ class QuadrotorTask(Spec):
         if (self.reference is None) != (train.form != "track"):
             raise ValueError("expected a reference with a reward of form 'track', and with that alone")
         self._check_references()
+        self._check_distribution()
         for where, start in (("start", self.start), ("evaluation.start", self.evaluation.start)):
             reach = 3**0.5 * start.position_m
             if reach >= self.bounds.distance_m:
@@ -185,6 +191,14 @@ class QuadrotorTask(Spec):
                     f" {start.position_m:g} along each axis), found {self.bounds.distance_m:g}"
                 )
         return _periods_fit(self)
+
+    def _check_distribution(self) -> None:
+        if self.distribution is None:
+            return
+        if self.action != "rotor_speed":
+            raise ValueError("expected action 'rotor_speed' with a distribution of vehicles: their thrusts differ")
+        if len(self.vehicle.motors) != 4 or not self.vehicle.upright:
+            raise ValueError("expected a vehicle of four motors along z with a distribution of vehicles")
 
     def _check_references(self) -> None:
         if self.preview_s and self.reference is None:
@@ -221,6 +235,7 @@ class QuadrotorTask(Spec):
     def ideal(self) -> bool:
         """Whether this is the paper's world: thrust at once, no drag, nothing uncertain, no memory."""
         plain = self.memory == Memory() and self.policy_frame == "world" and self.reference is None
+        plain = plain and self.action == "thrust"
         return self.vehicle.ideal and self.uncertainty is None and plain
 
     def warnings(self) -> list[str]:
@@ -306,6 +321,7 @@ _PARTS = {
     "vehicle": (vehicle_data, shipped_vehicles),
     "uncertainty": (uncertainty_data, shipped_uncertainties),
     "reference": (reference_data, shipped_references),
+    "distribution": (distribution_data, shipped_distributions),
 }
 
 

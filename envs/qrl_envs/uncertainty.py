@@ -12,14 +12,15 @@ from qrl_envs.specfile import NonNegative, Positive, Spec
 MOST_LATENCY_S = 0.1
 
 
-def _ascending(pair: tuple[float, float]) -> tuple[float, float]:
+def ascending(pair: tuple[float, float]) -> tuple[float, float]:
+    """`pair`; ValueError unless it is [least, greatest]."""
     if pair[0] > pair[1]:
         raise ValueError(f"expected [least, greatest], found [{pair[0]:g}, {pair[1]:g}]")
     return pair
 
 
-Range = Annotated[tuple[NonNegative, NonNegative], AfterValidator(_ascending)]
-Factor = Annotated[tuple[Positive, Positive], AfterValidator(_ascending)]
+Range = Annotated[tuple[NonNegative, NonNegative], AfterValidator(ascending)]
+Factor = Annotated[tuple[Positive, Positive], AfterValidator(ascending)]
 ZERO, ONE = (0.0, 0.0), (1.0, 1.0)
 
 

@@ -152,6 +152,11 @@ class Vehicle(Spec):
         return np.array([(*motor.position_m, 0.0)[:3] for motor in self.motors]).T
 
     @property
+    def upright(self) -> bool:
+        """Whether all motors push along body z."""
+        return bool(np.allclose(self.motor_axes[:2], 0.0, atol=1e-9))
+
+    @property
     def motor_axes(self) -> np.ndarray:
         """Unit vectors along which thrust acts, body frame; [3, motors]."""
         axes = np.array([motor.axis for motor in self.motors]).T
@@ -183,6 +188,12 @@ class Vehicle(Spec):
             if np.allclose(self.motor_axes @ thrusts, weight * direction, atol=1e-6 * weight):
                 break
         return thrusts
+
+    @property
+    def hover_speeds(self) -> np.ndarray:
+        """The rotors' speeds in hover, of their greatest: w with c·w + (1 − c)·w² = thrust/max; [motors], float64."""
+        share, c = self.hover_thrusts_N / [motor.max_N for motor in self.motors], self.thrust_curve
+        return 2.0 * share / (c + np.sqrt(c * c + 4.0 * (1.0 - c) * share))
 
     @property
     def angular_acceleration_rad_s2(self) -> np.ndarray:

@@ -171,7 +171,7 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
     steps = ("num_timesteps", "episode_length", "unroll_length", "apg_episode_length")
     values = values | {name: max(1, round(values[name] * rate)) for name in steps if values[name]}
     values["gamma"] = float(values["gamma"]) ** (1.0 / rate)
-    if isinstance(task, task_spec.QuadrotorTask):
+    if isinstance(task, task_spec.QuadrotorTask) and task.distribution is None:
         slower = task.vehicle.recovery_s / PRESET_RECOVERY_S
         # Flights of APG that are over before the vehicle has settled teach it nothing about precision.
         longer = min(4, 2 ** max(0, round(np.log2(slower))))
@@ -180,8 +180,8 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
         if not (vehicle := task.vehicle).ideal:
             each = vehicle.action_scale_N * len(vehicle.motors) / vehicle.mass_kg
             values["apg_learning_rate"] *= min(1.0, PRESET_ACTION_M_S2 / each)
-        if not task.ideal and values["observation_scale"]:
-            values["observation_scale"] = [*values["observation_scale"], *_other_scales(task)]
+    if isinstance(task, task_spec.QuadrotorTask) and not task.ideal and values["observation_scale"]:
+        values["observation_scale"] = [*values["observation_scale"], *_other_scales(task)]
     reward = task.reward
     if isinstance(reward, task_spec.CircleReward) and values["observation_scale"]:
         length, speed = max(1.0, reward.radius_m), max(1.0, abs(reward.speed_m_s) / 2.0)

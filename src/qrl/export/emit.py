@@ -77,7 +77,8 @@ def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
     act = []
     for a, limits, lsb in zip(policy.actions, _act_ranges(kernel), kernel.act_lsb.tolist(), strict=True):
         motor = {} if a.position_m is None else {"position_m": list(a.position_m), "spin": a.spin}
-        port = {"name": a.name, "unit": a.unit, "frame": a.frame, **motor, "range": limits, "lsb": lsb}
+        quantity = {} if a.quantity is None else {"quantity": a.quantity}
+        port = {"name": a.name, "unit": a.unit, **quantity, "frame": a.frame, **motor, "range": limits, "lsb": lsb}
         act.append(port | {"safe": float(np.float32(a.safe))})
     return {
         "format": FORMAT,

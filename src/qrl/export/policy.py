@@ -31,6 +31,7 @@ class ActionSpec:
     safe: float  # the action when an observation is not finite
     position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
+    quantity: str | None = None  # where `unit` does not say it
 
     @property
     def limits(self) -> tuple[float, float]:
