@@ -129,6 +129,18 @@ def list_failures(task: Task, observations: np.ndarray, success: np.ndarray, lim
     ]
 
 
+def in_world(task: Task, observations: np.ndarray) -> np.ndarray:
+    """Observations [n, K + 1, F] of an evaluation; where the task tracks a reference, with position and velocity in the
+    world, not relative to it.
+    """
+    found = np.array(observations, float)
+    if isinstance(task, QuadrotorTask) and (followed := task.evaluation.reference):
+        reference = followed.at(np.arange(found.shape[1]) * task.control_period_s)
+        found[:, :, 9:12] += reference.position_m
+        found[:, :, 12:15] += reference.velocity_m_s
+    return found
+
+
 def tilt_deg(observations: np.ndarray) -> np.ndarray:
     """Angle between body z and world z [°], for a quadrotor's observations [..., 18]; [...]."""
     return np.degrees(np.arccos(np.clip(observations[..., 8], -1.0, 1.0)))

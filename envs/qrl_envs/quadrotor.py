@@ -3,6 +3,7 @@
 World and body frames: x forward, y left, z up. Quaternions [w, x, y, z], body -> world.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import chex
@@ -168,7 +169,7 @@ def in_body_frame(observation: chex.Array, view: BodyView) -> chex.Array:
     numbers = jnp.unstack(observation, axis=-1)
     rows = numbers[0:3], numbers[3:6], numbers[6:9]
 
-    def rotated(vector: list[chex.Array]) -> list[chex.Array]:
+    def rotated(vector: Sequence[chex.Array]) -> list[chex.Array]:
         return [
             sum(row[j] * x for row, x in zip(rows[1:], vector[1:], strict=False)) + rows[0][j] * vector[0]
             for j in range(3)

@@ -41,6 +41,7 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
     grid = list(figure.subplots(rows, 2, sharex=True).flat)
     for axes, name in zip(grid, names, strict=False):
         label, unit, tolerance = ERRORS[name]
+        label = label.replace("target", "reference") if getattr(task.evaluation, "reference", None) else label
         panel = logarithmic(label, unit, _ranks(found.errors[name]), getattr(task.evaluation, tolerance))
         times = over_time(axes, task, panel)
         low, median, high = panel.values

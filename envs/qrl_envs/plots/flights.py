@@ -27,7 +27,7 @@ def figure(task: Task, observations: np.ndarray) -> Figure:
         _phase_portrait(left, task, shown)
         panels = _pendulum_panels(task, shown)
     else:
-        _seen_from_above(left, task, shown)
+        _seen_from_above(left, task, measures.in_world(task, shown))
         panels = _quadrotor_panels(task, shown, found.errors)
     for axes, panel in zip((upper, lower), panels, strict=True):
         times = over_time(axes, task, panel)
@@ -58,6 +58,10 @@ def _seen_from_above(axes: Axes, task: QuadrotorTask, shown: np.ndarray) -> None
     if isinstance(reward, CircleReward):
         _circle(axes, reward)
         reach = reward.radius_m
+    elif followed := task.evaluation.reference:
+        path = followed.at(np.arange(shown.shape[1]) * task.control_period_s).position_m
+        axes.plot(*path.T[:2], "--", color="black", linewidth=1.5, zorder=5, label="reference")
+        reach = float(np.abs(path[:, :2]).max())
     else:
         axes.plot(0, 0, "+", color="black", markersize=15, markeredgewidth=2, zorder=5, label="target position")
     # Shows target and starts; distant parts of the paths are cut off.
@@ -117,7 +121,9 @@ def _quadrotor_panels(task: QuadrotorTask, shown: np.ndarray, errors: dict[str, 
             Panel("tangential speed", "m/s", speed, _limits(speed, reward.speed_m_s), reward.speed_m_s, spec.speed_m_s),
         )
     return (
-        logarithmic("distance to target", "m", few["position_m"], spec.distance_m),
+        logarithmic(
+            f"distance to {'reference' if spec.reference else 'target'}", "m", few["position_m"], spec.distance_m
+        ),
         Panel("tilt", "°", measures.tilt_deg(shown), (0.0, 180.0)),
     )
 

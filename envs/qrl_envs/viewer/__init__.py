@@ -83,9 +83,10 @@ def _data(task: Task, title: str, recording: Recording) -> dict[str, Any]:
         world, panels = _rod(task), _pendulum_panels(task, observations, actions)
         motion = {"angle_rad": _plain(np.arctan2(observations[..., 1], observations[..., 0])[:, ::stride], 1e-4)}
     else:
-        world, panels = _vehicle(task), _quadrotor_panels(task, observations, actions, found)
+        there = measures.in_world(task, observations)
+        world, panels = _vehicle(task, samples, stride), _quadrotor_panels(task, there, actions, found)
         motion = {  # [n, 3, samples], as the scene needs them
-            "position_m": _plain(observations[:, ::stride, 9:12].swapaxes(1, 2), 1e-4),
+            "position_m": _plain(there[:, ::stride, 9:12].swapaxes(1, 2), 1e-4),
             "forward": _plain(observations[:, ::stride, [0, 3, 6]].swapaxes(1, 2), 1e-4),
             "up": _plain(observations[:, ::stride, [2, 5, 8]].swapaxes(1, 2), 1e-4),
         }
@@ -155,20 +156,31 @@ def _outcome(found: Measured, i: int, end_s: float) -> str:
 # Data of the 3D scene
 
 
-def _vehicle(task: QuadrotorTask) -> dict[str, Any]:
-    wanted = task.evaluation.reward
+def _vehicle(task: QuadrotorTask, samples: int, stride: int) -> dict[str, Any]:
+    wanted, path = task.evaluation.reward, None
+    if followed := task.evaluation.reference:  # [3, samples]
+        times = np.arange(0, samples, stride) * task.control_period_s
+        path = _plain(followed.at(times).position_m.T, 1e-4)
     return {
         "vehicle": {
             "motors": [
-                {"position_m": motor.position_m, "max_N": motor.max_N, "color": line.color}
+                {"position_m": motor.position_m, "most": _most_action(task, motor.max_N), "color": line.color}
                 for motor, line in zip(task.vehicle.motors, _motors(task), strict=True)
             ]
         },
+        "acted": {"name": "speed", "unit": "of the greatest"}
+        if task.action == "rotor_speed"
+        else {"name": "thrust", "unit": "N"},
         "wanted": {
             "radius_m": wanted.radius_m if isinstance(wanted, CircleReward) else 0.0,
+            "path_m": path,
             "tolerance_m": task.evaluation.distance_m,
         },
     }
+
+
+def _most_action(task: QuadrotorTask, max_N: float) -> float:
+    return 1.0 if task.action == "rotor_speed" else max_N
 
 
 def _motors(task: QuadrotorTask) -> list[Line]:
@@ -203,11 +215,14 @@ def _quadrotor_panels(
         beyond = 1.5 * wanted.speed_m_s  # below 0 for a clockwise circle
         limits = max(lowest, _least(speed, min(0.0, beyond))), min(highest, _most(speed, max(0.0, beyond)))
     else:
-        target, distance, band = "target", error["position_m"], None
+        target = "reference" if spec.reference else "target"
+        distance, band = error["position_m"], None
         label, speed = "speed", np.linalg.norm(observations[..., 12:15], axis=-1)
         limits = 0.0, _most(speed)
     least = MIN_SHOWN * spec.distance_m
-    most_N = max(motor.max_N for motor in task.vehicle.motors)
+    rotor_speed = task.action == "rotor_speed"
+    most = 1.0 if rotor_speed else max(motor.max_N for motor in task.vehicle.motors)
+    acted = ("rotor speed, of its greatest", "rotor speed", "1") if rotor_speed else ("thrust", "thrust", "N")
     thrusts = [line._replace(values=actions[..., i]) for i, line in enumerate(_motors(task))]
     return [
         Panel(label, "speed", "m/s", [Line("", BLUE, speed)], _roomy(*limits), 1e-3, 2, band),
@@ -220,9 +235,9 @@ def _quadrotor_panels(
             scale="log",
         ),
         Panel(
-            *("thrust", "thrust", "N", thrusts, _roomy(0.0, most_N)),
-            resolution=5e-4 * most_N,
-            decimals=3 if most_N < 1.0 else 2,
+            *(*acted, thrusts, _roomy(0.0, most)),
+            resolution=5e-4 * most,
+            decimals=3 if most < 1.0 or rotor_speed else 2,
             held=True,
         ),
     ]

@@ -91,7 +91,9 @@ function vehicleScene(div, page, onCamera) {
   function extent() {
     const reach = wanted.radius_m + wanted.tolerance_m;
     const spans = flight.position_m.map((values, axis) => {
-      const seen = values.filter(v => v !== null), target = axis < 2 ? reach : wanted.tolerance_m;
+      const seen = values.filter(v => v !== null);
+      if (wanted.path_m) return [Math.min(...seen, ...wanted.path_m[axis]), Math.max(...seen, ...wanted.path_m[axis])];
+      const target = axis < 2 ? reach : wanted.tolerance_m;
       return [Math.min(-target, ...seen), Math.max(target, ...seen)];
     });
     const longest = Math.max(...spans.map(([a, b]) => b - a));
@@ -107,7 +109,7 @@ function vehicleScene(div, page, onCamera) {
   function placed({ position, forward, left, up, actions }) {
     return columns(shape.vertices.map(([x, y, z], i) => {
       const motor = shape.lifted[i];
-      if (motor >= 0) z += BAR * shape.arm * Math.max(0.004, actions[motor] / motors[motor].max_N);
+      if (motor >= 0) z += BAR * shape.arm * Math.max(0.004, actions[motor] / motors[motor].most);
       return [0, 1, 2].map(c => position[c] + magnified * (x * forward[c] + y * left[c] + z * up[c]));
     }));
   }
@@ -116,13 +118,16 @@ function vehicleScene(div, page, onCamera) {
     const [x, y, z] = placed(now), [px, py, pz] = now.position, floor = box[2][0];
     const path = flight.position_m.map((values, c) => [...values.slice(0, now.index + 1), now.position[c]]);
     const ahead = flight.position_m.map((values, c) => [now.position[c], ...values.slice(now.index + 1, flight.samples)]);
-    return {
-      x: [x, path[0], ahead[0], [px, px], [px]], y: [y, path[1], ahead[1], [py, py], [py]],
-      z: [z, path[2], ahead[2], [pz, floor], [floor]],
-    };
+    const of = [
+      [x, path[0], ahead[0], [px, px], [px]], [y, path[1], ahead[1], [py, py], [py]],
+      [z, path[2], ahead[2], [pz, floor], [floor]],
+    ];
+    if (wanted.path_m) of.forEach((values, c) => values.push([wanted.path_m[c][Math.min(now.index, wanted.path_m[c].length - 1)]]));
+    return { x: of[0], y: of[1], z: of[2] };
   }
 
-  const MOVING = [0, 1, 2, 3, 4];
+  const MOVING = wanted.path_m ? [0, 1, 2, 3, 4, 5] : [0, 1, 2, 3, 4];
+  const LOG_LEAST = -3, LOG_MOST = Math.log10(wanted.tolerance_m); // colors of the trail: from 1 mm to the tolerance
 
   function traces(now) {
     const m = moving(now), [X, Y, Z] = flight.position_m, floor = Z.map(z => z === null ? null : box[2][0]);
@@ -132,9 +137,19 @@ function vehicleScene(div, page, onCamera) {
       line3d(m.x[2], m.y[2], m.z[2], { color: "#a3aab2", width: 3 }),
       line3d(m.x[3], m.y[3], m.z[3], { color: "#8a9199", width: 2, dash: "dot" }),
       { type: "scatter3d", mode: "markers", x: m.x[4], y: m.y[4], z: m.z[4], hoverinfo: "skip", marker: { color: "#6b7278", size: 4 } },
+      ...(wanted.path_m ? [{ type: "scatter3d", mode: "markers", x: m.x[5], y: m.y[5], z: m.z[5], hoverinfo: "skip", marker: { color: "#007a59", size: 6, symbol: "diamond" } }] : []),
       line3d(X, Y, floor, { color: "#dcdfe3", width: 3 }),
-      meshTrace(toleranceShape(wanted.radius_m, wanted.tolerance_m), { color: "#009E73", opacity: wanted.radius_m ? 0.16 : 0.28, flatshading: false, lighting: light }),
     ];
+    if (wanted.path_m) {
+      const [x, y, z] = wanted.path_m, off = flight.panels[1][0];
+      const color = off.map(e => Math.min(LOG_MOST, Math.max(LOG_LEAST, Math.log10(e || 1e-9))));
+      all.push(line3d(x, y, z, { color: "#007a59", width: 3, dash: "dash" }));
+      all.push(line3d(X, Y, Z, { color, colorscale: "Portland", cmin: LOG_LEAST, cmax: LOG_MOST, width: 6 }));
+      return all;
+    }
+    all.push(
+      meshTrace(toleranceShape(wanted.radius_m, wanted.tolerance_m), { color: "#009E73", opacity: wanted.radius_m ? 0.16 : 0.28, flatshading: false, lighting: light }),
+    );
     if (wanted.radius_m) {
       const turn = Array.from({ length: 145 }, (_, i) => 2 * Math.PI * i / 144);
       all.push(line3d(turn.map(a => wanted.radius_m * Math.cos(a)), turn.map(a => wanted.radius_m * Math.sin(a)), turn.map(() => 0), { color: "#007a59", width: 4, dash: "dash" }));
@@ -216,11 +231,12 @@ function vehicleScene(div, page, onCamera) {
       await Plotly.relayout(div, on ? follow(now) : { "scene.camera": overview });
     },
     scale() {
-      const metres = BAR * shape.arm * magnified, most = Math.max(...motors.map(m => m.max_N));
+      const metres = BAR * shape.arm * magnified, most = Math.max(...motors.map(m => m.most));
       const size = magnified === 1 ? "vehicle to scale" : `vehicle drawn ×${magnified}`;
-      const target = wanted.radius_m ? "circle" : "target";
-      return `${size}, black nose forward; thrust bars: ${metres.toPrecision(2)} m is ${most.toPrecision(3)} N;`
-        + ` green: within ${wanted.tolerance_m} m of the ${target}`;
+      const target = wanted.radius_m ? "circle" : "target", { name, unit } = page.acted;
+      const shown = wanted.path_m ? ` green: the reference, dashed; trail: blue 1 mm off it, red ${wanted.tolerance_m} m`
+        : ` green: within ${wanted.tolerance_m} m of the ${target}`;
+      return `${size}, black nose forward; ${name} bars: ${metres.toPrecision(2)} m is ${most.toPrecision(3)} ${unit};${shown}`;
     },
     probe: now => placed(now).map(values => values[0]),
   };
