@@ -265,8 +265,11 @@ class RealQuadrotorEnv(QuadrotorEnv):
     """
 
     def __init__(
-        self, task: QuadrotorTask, uncertainty: Uncertainty | None = None, most_latency_s: float | None = None
+        self, task: QuadrotorTask, uncertainty: Uncertainty | None = None, shaped_for: Uncertainty | None = None
     ) -> None:
+        """With `uncertainty` in place of the task's; its state is shaped for `shaped_for`, so that environments which
+        differ in what is uncertain share a program.
+        """
         super().__init__(task)
         uncertainty = uncertainty or task.uncertainty or Uncertainty()
         self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
@@ -274,8 +277,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         motors, integrals = len(task.vehicle.motors), self._integrator.size if self._integrator else 0
         self.policy_observation_size = 18 + task.memory.previous_action * motors + integrals
         self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
-        latency_s = uncertainty.latency_s[1] if most_latency_s is None else most_latency_s
-        self._steps_late = plant.delayed_steps(latency_s, task.control_period_s)
+        self._layout = (shaped_for or uncertainty).layout(task.control_period_s)
 
     def step(self, state: State, action: chex.Array) -> State:
         return self._with_truth(super().step(state, action))
@@ -297,11 +299,14 @@ class RealQuadrotorEnv(QuadrotorEnv):
 
     def _draw(self, params: Any, rng: chex.PRNGKey) -> plant.Flight:
         # The start's key is that of the ideal world: the same starts, whatever the plant.
-        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (plant.DRAWS + self.action_size,))
+        stream, more = jax.random.fold_in(rng, WORLD_STREAM), None
+        u = jax.random.uniform(stream, (plant.DRAWS + self.action_size,))
+        if self._layout.gusts or self._layout.positions:  # apart, so that what was drawn before these were there stays
+            more = jax.random.uniform(jax.random.fold_in(stream, 0), (plant.MORE_DRAWS,))
         return plant.begin(
             self._start(params, rng),
-            plant.draw(params.ranges, params.physics, u),
-            self._steps_late,
+            plant.draw(params.ranges, params.physics, u, self._layout, more),
+            self._layout,
             self._integrator,
             self.task.control_period_s,
         )

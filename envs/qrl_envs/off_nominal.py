@@ -25,7 +25,10 @@ NOISE = {
 }
 LAGS_S = (0.02, 0.05, 0.072, 0.1, 0.15)
 LATENCY_S = 0.01
-MOST_LATENCY_S = 0.02
+# What a program that serves all conditions must have room for.
+SHAPED_FOR = Uncertainty(
+    latency_s=(0.0, 0.02), gust_m_s=(0.0, 1.0), position_period_s=(0.0, 1.0 / 30.0), position_delay_s=(0.0, 0.01)
+)
 
 
 class Condition(NamedTuple):
@@ -91,7 +94,7 @@ class OffNominal(RealQuadrotorEnv):
     """
 
     def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
-        super().__init__(task, condition.uncertainty, MOST_LATENCY_S)
+        super().__init__(task, condition.uncertainty, SHAPED_FOR)
         self.params: Any = OffNominalParams(*self.params, paper_trial=jnp.bool_(condition.paper_trial))  # pyright: ignore[reportCallIssue]
 
     def _start(self, params: Any, key: chex.PRNGKey) -> plant.Body:

@@ -131,8 +131,8 @@ class QuadrotorTask(Spec):
     episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
     uncertainty: Uncertainty | None = None
-    memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `vehicle.Later`
-    # The frame of what a policy network is given: the world's, or the body's without the heading. As `vehicle.Later`.
+    memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `specfile.later`
+    # The frame of what a policy network is given: the world's, or the body's without the heading. As `specfile.later`.
     policy_frame: Annotated[Literal["world", "body"], Field(exclude_if=lambda x: x == "world")] = "world"
     start: FlightStart
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
