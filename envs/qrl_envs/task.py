@@ -186,7 +186,17 @@ class QuadrotorTask(Spec):
 
     def warnings(self) -> list[str]:
         """What is accepted and may not work, in one line each."""
-        return [f"vehicle: {text}" for text in self.vehicle.warnings()]
+        lag = self.lag_not_trained
+        return [
+            *(f"vehicle: {text}" for text in self.vehicle.warnings()),
+            *([f"{lag}: no policy that is trained so has met it"] if lag else []),
+        ]
+
+    @property
+    def lag_not_trained(self) -> str | None:
+        """Why a policy trained on this task has not met its vehicle's own lag, in one line; None: it has."""
+        own_s = self.vehicle.rotor_rise_s, self.vehicle.rotor_fall_s
+        return self.uncertainty.excludes_lag(own_s) if self.uncertainty else None
 
 
 class PendulumStart(Spec):

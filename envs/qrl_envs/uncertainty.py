@@ -60,6 +60,17 @@ class Uncertainty(Spec):
                 raise ValueError(f"expected {name} of at most {most_s:g} s, found {found:g}")
         return self
 
+    def excludes_lag(self, own_s: tuple[float, float]) -> str | None:
+        """Which range leaves out a vehicle's own time constants, of rise and fall, in one line; None: none does."""
+        name, given, own = "rotor_lag_factor", self.rotor_lag_factor, (1.0,)
+        if self.rotor_lag_s is not None:
+            name, given, own = "rotor_lag_s", self.rotor_lag_s, own_s
+        slack = ROUNDING * given[1]
+        if max(own_s) == 0.0 or (given[0] - slack <= min(own) and max(own) <= given[1] + slack):
+            return None
+        said = " and ".join(f"{1e3 * x:g}" for x in dict.fromkeys(own_s))
+        return f"uncertainty.{name} [{given[0]:g}, {given[1]:g}] leaves out the vehicle's own lag of {said} ms"
+
     def layout(self, period_s: float) -> "Layout":
         """The shape of a flight's state under these ranges, at a control period."""
         late = max(self.position_period_s[1], self.position_delay_s[1], self.bias_wander_m[1]) > 0.0
