@@ -264,8 +264,11 @@ class RealQuadrotorEnv(QuadrotorEnv):
     """
 
     def __init__(
-        self, task: QuadrotorTask, uncertainty: Uncertainty | None = None, most_latency_s: float | None = None
+        self, task: QuadrotorTask, uncertainty: Uncertainty | None = None, shaped_for: Uncertainty | None = None
     ) -> None:
+        """With `uncertainty` in place of the task's; its state is shaped for `shaped_for`, so that environments which
+        differ in what is uncertain share a program.
+        """
         super().__init__(task)
         uncertainty = uncertainty or task.uncertainty or Uncertainty()
         self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
@@ -275,8 +278,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         ahead = 3 * len(task.preview_s)
         self.policy_observation_size = 18 + ahead + task.memory.previous_action * motors + integrals
         self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
-        latency_s = uncertainty.latency_s[1] if most_latency_s is None else most_latency_s
-        self._steps_late = plant.delayed_steps(latency_s, task.control_period_s)
+        self._layout = (shaped_for or uncertainty).layout(task.control_period_s)
 
     def _followed(self, spec: Reference | None, flight_s: float, anywhere: bool) -> Figure | Motion | None:
         """The reference that `spec` describes; of a figure that repeats, flights may begin anywhere."""
@@ -321,20 +323,23 @@ class RealQuadrotorEnv(QuadrotorEnv):
 
     def _draw(self, params: Any, rng: chex.PRNGKey) -> plant.Flight:
         # The start's key is that of the ideal world: the same starts, whatever the plant.
+        stream, more = jax.random.fold_in(rng, WORLD_STREAM), None
         draws, others = plant.DRAWS + self.action_size, self._reference.draws if self._reference else 0
         vehicles, own = self.task.distribution, None
-        count = draws + others + (distribution.DRAWS if vehicles else 0)
-        u = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM), (count,))
+        u = jax.random.uniform(stream, (draws + others + (distribution.DRAWS if vehicles else 0),))
+        if self._layout.gusts or self._layout.positions:  # apart, so that what was drawn before these were there stays
+            more = jax.random.uniform(jax.random.fold_in(stream, 0), (plant.MORE_DRAWS,))
         if vehicles:
             own = distribution.draw(vehicles, params.physics, self.task.vehicle, u[draws + others :])
-        world, body, origin_m = plant.draw(params.ranges, params.physics, u[:draws], own), self._start(params, rng), 0.0
+        world = plant.draw(params.ranges, params.physics, u[:draws], self._layout, more, own)
+        body, origin_m = self._start(params, rng), 0.0
         if self._reference:
             thrust = jnp.sum(world.motor_factor * world.physics.motor_max_N)
             world = world._replace(reference=self._reference.draw(u[draws : draws + others], world.physics, thrust))
             target = self._reference.at(world.reference, jnp.int32(0))
             origin_m = target.position_m
             body = plant.relative(body, jax.tree.map(jnp.negative, target))
-        return plant.begin(body, world, self._steps_late, self._integrator, self.task.control_period_s, origin_m)
+        return plant.begin(body, world, self._layout, self._integrator, self.task.control_period_s, origin_m)
 
     def _advance(self, params: Params, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
         world, before = x.world, x.previous_action

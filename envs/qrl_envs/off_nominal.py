@@ -1,4 +1,4 @@
-"""Evaluation under conditions that a task does not name: rotors that lag, latency, other mass, wind, noise, start.
+"""Evaluation under conditions that a task does not name: lag, latency, other mass, wind, gusts, sensors, rate, start.
 
 Each is an `Uncertainty` whose ranges are points, flown on the plant of real vehicles; success and errors are measured
 on the true state, as in the task. The magnitudes are this project's; the paper's trial starts as in its figure of a
@@ -23,9 +23,11 @@ NOISE = {
     "attitude_noise_rad": 0.01,
     "body_rate_noise_rad_s": 0.02,
 }
+FIXES = {"position_period_s": 1.0 / 30.0, "position_delay_s": 0.01, "bias_wander_m": 0.005}  # motion capture
+GUSTS = {"gust_m_s": 1.0, "gust_s": 1.0}
+BIAS_M = 0.02
 LAGS_S = (0.02, 0.05, 0.072, 0.1, 0.15)
 LATENCY_S = 0.01
-MOST_LATENCY_S = 0.02
 
 
 class Condition(NamedTuple):
@@ -34,10 +36,19 @@ class Condition(NamedTuple):
     description: str  # one line
     uncertainty: Uncertainty = Uncertainty()
     paper_trial: bool = False  # start with the position and velocity of the paper's trial
+    held_periods: int = 1  # periods of the task for which each action of the policy is applied
+    periods: int = 1  # of the policy in one of the task
+
+    def environment(self, task: QuadrotorTask) -> "OffNominal":
+        """The task under this condition."""
+        return (OffNominal if self.periods == 1 else Faster)(task, self)
 
 
 def _fixed(**values: float) -> Uncertainty:
     return Uncertainty(**{name: (value, value) for name, value in values.items()})
+
+
+SHAPED_FOR = _fixed(latency_s=2 * LATENCY_S, **GUSTS, **FIXES)  # what one program for all conditions has room for
 
 
 def conditions(task: QuadrotorTask) -> dict[str, Condition]:
@@ -61,7 +72,14 @@ def conditions(task: QuadrotorTask) -> dict[str, Condition]:
     blows = "2 m/s of wind" if "wind_m_s" in wind else "a force of 5 % of the weight"
     if "wind_m_s" in wind:
         named["wind"] = Condition("2 m/s of wind", _fixed(**wind))
+    gusts_blow = "through drag" if "wind_m_s" in wind else "as a force of 2.5 % of the weight for each m/s"
+    fixes = "position at 30 Hz, 10 ms late, with a bias that wanders by 5 mm (1 σ, each axis, 5 s); velocity from it"
     named |= {
+        "gusts": Condition(f"gusts of 1 m/s (1 σ, each axis, 1 s), {gusts_blow}", _fixed(**GUSTS)),
+        "bias": Condition("the position measured 2 cm off, in any direction", _fixed(position_bias_m=BIAS_M)),
+        "estimator": Condition(fixes, _fixed(**FIXES)),
+        "half_rate": Condition("the policy at half of its rate", held_periods=2),
+        "double_rate": Condition("the policy at double its rate", periods=2),
         "noise": Condition("sensors err by 1 cm, 2 cm/s, 0.01 rad, 0.02 rad/s (1 σ, each axis)", _fixed(**NOISE)),
         "together": Condition(
             f"latency of 10 ms, noise, mass 20 % above, {blows}",
@@ -82,6 +100,7 @@ class OffNominalParams(NamedTuple):
     bounds: Any
     ranges: plant.Ranges
     paper_trial: chex.Array  # [] bool
+    held_periods: chex.Array  # [] int32
 
 
 class OffNominal(RealQuadrotorEnv):
@@ -91,8 +110,13 @@ class OffNominal(RealQuadrotorEnv):
     """
 
     def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
-        super().__init__(task, condition.uncertainty, MOST_LATENCY_S)
-        self.params: Any = OffNominalParams(*self.params, paper_trial=jnp.bool_(condition.paper_trial))  # pyright: ignore[reportCallIssue]
+        super().__init__(task, condition.uncertainty, SHAPED_FOR)
+        flags = {"paper_trial": jnp.bool_(condition.paper_trial), "held_periods": jnp.int32(condition.held_periods)}
+        self.params: Any = OffNominalParams(*self.params, **flags)  # pyright: ignore[reportCallIssue]
+
+    def _advance(self, params: Any, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
+        held = x.steps % params.held_periods != 0
+        return super()._advance(params, x, jnp.where(held, x.previous_action, action))
 
     def _start(self, params: Any, key: chex.PRNGKey) -> plant.Body:
         body = super()._start(params, key)
@@ -102,3 +126,18 @@ class OffNominal(RealQuadrotorEnv):
             for pair in zip(trial, (body.pose.position_m, body.twist.velocity_m_s), strict=True)
         )
         return plant.Body(body.pose._replace(position_m=position), body.twist._replace(velocity_m_s=velocity))
+
+
+class Faster(OffNominal):
+    """A policy at a higher rate than its task's: its previous action is as many periods nearer. The integral counts
+    seconds, and the return as many rewards as at the task's rate.
+    """
+
+    def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
+        self._periods = condition.periods
+        short = task.model_copy(update={"control_period_s": task.control_period_s / condition.periods})
+        super().__init__(short, condition)
+
+    def _advance(self, params: Any, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
+        flight, reward = super()._advance(params, x, action)
+        return flight, reward / self._periods

@@ -9,21 +9,21 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from qrl_envs import integrate, quadrotor, rotation, rotors
+from qrl_envs import gusts, integrate, quadrotor, rotation, rotors, sensors
 from qrl_envs.distribution import Drawn
+from qrl_envs.gusts import Gust
 from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
 from qrl_envs.rotors import Rotors
+from qrl_envs.sensors import Fixes, History, Noise, Sensors
 from qrl_envs.target import Target
 from qrl_envs.task import CircleReward, QuadrotorTask
-from qrl_envs.uncertainty import Uncertainty
+from qrl_envs.uncertainty import Layout, Uncertainty
 from qrl_envs.vehicle import Vehicle
 
 LEAST_THRUST = 1.45  # of weight and force together, unless the vehicle has less: below, a draw is made lighter
 MOST_BODY_RATE_RAD_S = 40.0  # where it saturates
 INTEGRATION_STEP_S = 0.01  # at most; halving it changes nothing that is reported (docs/real_vehicles.md)
-NOISE_ROWS = 4096
 
 
 class Ranges(NamedTuple):
@@ -45,17 +45,14 @@ class Ranges(NamedTuple):
     attitude_noise_rad: chex.Array
     body_rate_noise_rad_s: chex.Array
     position_bias_m: chex.Array
+    gust_m_s: chex.Array
+    gust_s: chex.Array
+    position_period_s: chex.Array
+    position_delay_s: chex.Array
+    bias_wander_m: chex.Array
+    bias_wander_s: chex.Array
     thrust_curve: chex.Array  # []
     drag_N_s_m: chex.Array  # [3]
-
-
-class Noise(NamedTuple):
-    """Standard deviations of Gaussian sensor errors, independent for each axis and step; scalars."""
-
-    position_m: chex.Array
-    velocity_m_s: chex.Array
-    attitude_rad: chex.Array
-    body_rate_rad_s: chex.Array
 
 
 class World(NamedTuple):
@@ -66,14 +63,13 @@ class World(NamedTuple):
     rotors: Rotors
     disturbance: Disturbance
     latency_s: chex.Array  # []
-    noise: Noise
-    position_bias_m: chex.Array  # [3] world
-    noise_row: chex.Array  # [] in [0, 1): where this flight begins in the table of noise
-    noise_stride: chex.Array  # [] in [0, 1)
+    sensors: Sensors
+    gust: Gust | tuple[()] = ()
     reference: Any = ()  # this flight's, of a task that tracks one (`target`)
 
 
 DRAWS = 23  # uniform numbers of a draw, besides one for each motor
+MORE_DRAWS = 7  # of gusts and fixes
 
 
 def ranges(uncertainty: Uncertainty, vehicle: Vehicle) -> Ranges:
@@ -85,7 +81,7 @@ def ranges(uncertainty: Uncertainty, vehicle: Vehicle) -> Ranges:
         low, high = uncertainty.rotor_lag_factor
         return low * own_s, high * own_s
 
-    data: dict[str, Any] = uncertainty.model_dump(exclude={"rotor_lag_factor", "rotor_lag_s"})
+    data: dict[str, Any] = {name: getattr(uncertainty, name) for name in Uncertainty.model_fields}
     data |= {"rotor_rise_s": lag(vehicle.rotor_rise_s), "rotor_fall_s": lag(vehicle.rotor_fall_s)}
     data |= {"thrust_curve": vehicle.thrust_curve, "drag_N_s_m": vehicle.drag_N_s_m}
     return Ranges(**{name: jnp.asarray(data[name], jnp.float32) for name in Ranges._fields})
@@ -98,8 +94,16 @@ def _direction(u: chex.Array) -> chex.Array:
     return jnp.stack([across * jnp.cos(angle), across * jnp.sin(angle), z])
 
 
-def draw(ranges: Ranges, physics: Physics, u: chex.Array, own: Drawn | None = None) -> World:
-    """The world of a flight, from u [DRAWS + N] uniform in [0, 1); of the flight's `own` vehicle, if it has one.
+def draw(
+    ranges: Ranges,
+    physics: Physics,
+    u: chex.Array,
+    layout: Layout | None = None,
+    more: chex.Array | None = None,
+    own: Drawn | None = None,
+) -> World:
+    """The world of a flight, from u [DRAWS + N] uniform in [0, 1); with gusts and fixes where `layout` has them, from
+    `more` [MORE_DRAWS] likewise; of the flight's `own` vehicle, if it has one.
 
     A vehicle whose thrust is then under LEAST_THRUST of its weight and the force on it, and under what the vehicle of
     the file has, is made lighter, and the force weaker.
@@ -121,6 +125,18 @@ def draw(ranges: Ranges, physics: Physics, u: chex.Array, own: Drawn | None = No
     roll = jnp.min(jnp.sum(jnp.abs(physics.motor_torque_m[:2]), axis=1)) / 2.0 * jnp.mean(physics.hover_thrust_N)
     wind = 2.0 * jnp.pi * u[3]
     lags = Rotors(within(ranges.rotor_rise_s, u[5]), within(ranges.rotor_fall_s, u[5]), ranges.thrust_curve)
+    gust, fixes = (), ()
+    if layout and layout.gusts and more is not None:
+        without_drag = jnp.all(drag_N_s_m == 0.0)
+        gust = Gust(
+            within(ranges.gust_m_s, more[0]),
+            within(ranges.gust_s, more[1]),
+            jnp.where(without_drag, gusts.WEIGHTS_S_M * own_weight_N, 0.0),
+        )
+    if layout and layout.positions and more is not None:
+        period_s = within(ranges.position_period_s, more[2])
+        others = (ranges.position_delay_s, ranges.bias_wander_m, ranges.bias_wander_s)
+        fixes = Fixes(period_s, period_s * more[3], *(within(pair, more[4 + i]) for i, pair in enumerate(others)))
     return World(
         physics=physics._replace(
             mass_kg=physics.mass_kg * mass, inertia_kg_m2=physics.inertia_kg_m2 * within(ranges.inertia_factor, u[4])
@@ -134,10 +150,14 @@ def draw(ranges: Ranges, physics: Physics, u: chex.Array, own: Drawn | None = No
             torque_N_m=within(ranges.torque_share, u[10]) * roll * _direction(u[11:13]),
         ),
         latency_s=within(ranges.latency_s, u[13]),
-        noise=Noise(*(within(getattr(ranges, name), u[14 + i]) for i, name in enumerate(NOISES))),
-        position_bias_m=within(ranges.position_bias_m, u[18]) * _direction(u[19:21]),
-        noise_row=u[21],
-        noise_stride=u[22],
+        sensors=Sensors(
+            noise=Noise(*(within(getattr(ranges, name), u[14 + i]) for i, name in enumerate(NOISES))),
+            bias_m=within(ranges.position_bias_m, u[18]) * _direction(u[19:21]),
+            row=u[21],
+            stride=u[22],
+            fixes=fixes,
+        ),
+        gust=gust,
     )
 
 
@@ -155,6 +175,8 @@ class Flight(NamedTuple):
     previous_action: chex.Array  # [N] applied
     integral_m_s: chex.Array  # [k] of the position error along the integrator's axes
     steps: chex.Array  # int32 []
+    history: History | tuple[()] = ()  # of positions, with `sensors.Fixes`
+    gust: chex.Array | tuple[()] = ()  # [2] along world x and y, of its standard deviation; with `Gust`
 
 
 class Integrator(NamedTuple):
@@ -178,15 +200,10 @@ def integrator(task: QuadrotorTask) -> Integrator | None:
     return Integrator(circle_m, integral.radius_m, integral.limit_m_s)
 
 
-def delayed_steps(latency_s: float, dt_s: float) -> int:
-    """D: how many set-points can matter at a latency."""
-    return int(np.ceil(latency_s / dt_s - 1e-6)) + 1
-
-
 def begin(
     body: Body,
     world: World,
-    steps_late: int,
+    layout: Layout,
     integrator: Integrator | None,
     dt_s: float,
     origin_m: chex.Array | float = 0.0,
@@ -197,11 +214,12 @@ def begin(
     physics = world.physics
     hover = rotors.speed_of(world.rotors.curve, physics.hover_thrust_N / physics.motor_max_N)
     motors = hover.shape[0]
-    sensed = sense(world, body, jnp.int32(0))
+    history = sensors.begin(world.sensors, body, layout.positions, dt_s)
+    sensed = sensors.sense(world.sensors, history, body, jnp.int32(0), dt_s)
     return Flight(
         body=body,
         speed=hover,
-        set_points=jnp.broadcast_to(hover, (steps_late, motors)),
+        set_points=jnp.broadcast_to(hover, (layout.set_points, motors)),
         world=world,
         sensed=sensed,
         previous_action=jnp.zeros(motors),
@@ -209,7 +227,14 @@ def begin(
             jnp.zeros(integrator.size if integrator else 0), sensed.pose.position_m - origin_m, integrator, dt_s
         ),
         steps=jnp.int32(0),
+        history=history,
+        gust=gusts.begin(world.gust, world.sensors),
     )
+
+
+def disturbance(flight: Flight) -> Disturbance:
+    """What acts on the body in the period that begins now, gusts among it."""
+    return gusts.disturbance(flight.world.disturbance, flight.world.gust, flight.gust)
 
 
 def step(
@@ -241,19 +266,21 @@ def step(
         speed = speed_at(jnp.float32(time_s)) if time_s else flight.speed
         return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, speed)
 
+    acting = disturbance(flight)
     substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
     body, short_s = flight.body, dt_s / substeps
     for i in range(substeps):
         begin_s, middle_s = i * short_s, (i + 0.5) * short_s
         body = integrate.midpoint(
-            lambda b, t=begin_s: quadrotor.derivative(physics, b, thrust_at(t), world.disturbance),
-            lambda b, t=middle_s: quadrotor.derivative(physics, b, thrust_at(t), world.disturbance),
+            lambda b, t=begin_s: quadrotor.derivative(physics, b, thrust_at(t), acting),
+            lambda b, t=middle_s: quadrotor.derivative(physics, b, thrust_at(t), acting),
             body,
             short_s,
         )
         body = _renormalized(body)
     steps = flight.steps + 1
-    sensed = sense(world, body, steps)
+    history = sensors.follow(world.sensors, flight.history, body, steps, dt_s)
+    sensed = sensors.sense(world.sensors, history, body, steps, dt_s)
     return Flight(
         body=body,
         speed=speed_at(jnp.float32(dt_s)),
@@ -263,6 +290,8 @@ def step(
         previous_action=applied,
         integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m - origin_m, integrator, dt_s),
         steps=steps,
+        history=history,
+        gust=gusts.after(world.gust, world.sensors, flight.gust, steps, dt_s),
     )
 
 
@@ -304,31 +333,6 @@ def integrated(total: chex.Array, position_m: chex.Array, integrator: Integrator
     return jnp.clip(total + dt_s * error * near**2, -integrator.limit_m_s, integrator.limit_m_s)
 
 
-def _noise_table() -> np.ndarray:
-    """Standard normal numbers [NOISE_ROWS, 12]. Drawn anew at each step they would take longer than the physics."""
-    return np.random.default_rng(2026).standard_normal((NOISE_ROWS, 12)).astype(np.float32)
-
-
-NOISE_TABLE = _noise_table()
-
-
-def sense(world: World, body: Body, steps: chex.Array) -> Body:
-    """`body` as measured at a flight's step: with bias and noise, of which each flight has its own sequence."""
-    # A prime stride and a random start, so that flights do not share pairs of rows at the same distance.
-    start = (world.noise_row * NOISE_ROWS).astype(jnp.int32)
-    stride = 2 * (world.noise_stride * 1000).astype(jnp.int32) + 1
-    row = jnp.asarray(NOISE_TABLE)[(start + steps * stride) % NOISE_ROWS]
-    row = jnp.moveaxis(row, -1, 0).reshape(4, 3, *steps.shape)
-    noise = world.noise
-    # A small-angle quaternion, normalized: a rotation exactly, its angle to 1e-5 of itself.
-    small = rotation.normalize(jnp.concatenate([jnp.ones_like(row[2, :1]), noise.attitude_rad / 2 * row[2]]))
-    (p, q), (v, w) = body
-    return Body(
-        Pose(p + world.position_bias_m + noise.position_m * row[0], rotation.product(q, small)),
-        Twist(v + noise.velocity_m_s * row[1], w + noise.body_rate_rad_s * row[3]),
-    )
-
-
 def observe(flight: Flight, previous_action: bool, target: Target | None = None) -> chex.Array:
     """What a policy observes: the measured body [18], relative to the target if there is one, then the target's preview
     [3k], then its memory: previous action [N], integral [k].
@@ -365,8 +369,9 @@ def privileged(flight: Flight, nominal: Physics, dt_s: float, own: bool = False)
 
     motors = world.motor_factor * world.physics.motor_max_N / nominal.motor_max_N if own else world.motor_factor
     weight_N = nominal.mass_kg * nominal.gravity_m_s2
-    drag = jnp.mean(world.disturbance.drag_N_s_m, axis=0)
-    push = world.disturbance.force_N + drag * world.disturbance.wind_m_s
+    acting = disturbance(flight)
+    drag = jnp.mean(acting.drag_N_s_m, axis=0)
+    push = acting.force_N + drag * acting.wind_m_s
     roll = jnp.min(jnp.sum(jnp.abs(nominal.motor_torque_m[:2]), axis=1), axis=0) * jnp.mean(
         nominal.hover_thrust_N, axis=0
     )
@@ -379,7 +384,7 @@ def privileged(flight: Flight, nominal: Physics, dt_s: float, own: bool = False)
             10.0 * world.rotors.fall_s,
             world.latency_s / dt_s,
             drag / nominal.mass_kg,
-            world.noise.position_m * 100.0,
+            world.sensors.noise.position_m * 100.0,
         ]
     )
     return jnp.concatenate([5.0 * push / weight_N, 20.0 * world.disturbance.torque_N_m / roll, factors, flight.speed])

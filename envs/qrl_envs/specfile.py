@@ -49,6 +49,11 @@ CountOrZero = Annotated[int, BeforeValidator(_as_int), Field(ge=0, lt=2**31)]
 T = TypeVar("T")
 
 
+def later(default: Any) -> Any:
+    """A field that came after the first runs: where it says nothing new it is not written; so fingerprints stay."""
+    return Field(default=default, exclude_if=lambda value: value == default)
+
+
 def nearest(word: str, known: list[str]) -> str:
     """' (did you mean …?)' with the closest known word, or the list of all known words."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)

@@ -155,15 +155,15 @@ class QuadrotorTask(Spec):
     episode_s: Positive  # maximum duration of a training episode
     vehicle: Vehicle
     uncertainty: Uncertainty | None = None
-    # Each flight has a vehicle of its own, with the places of the motors of `vehicle`. As `vehicle.Later`.
+    # Each flight has a vehicle of its own, with the places of the motors of `vehicle`. As `specfile.later`.
     distribution: Annotated[VehicleDistribution | None, Field(exclude_if=lambda x: x is None)] = None
     # What an action in [−1, 1] stands for: thrusts about hover, or the rotors' speeds from 0 to their greatest.
     action: Annotated[Literal["thrust", "rotor_speed"], Field(exclude_if=lambda x: x == "thrust")] = "thrust"
-    memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `vehicle.Later`
-    # The frame of what a policy network is given: the world's, or the body's without the heading. As `vehicle.Later`.
+    memory: Annotated[Memory, Field(exclude_if=lambda x: x == Memory())] = Memory()  # as `specfile.later`
+    # The frame of what a policy network is given: the world's, or the body's without the heading. As `specfile.later`.
     policy_frame: Annotated[Literal["world", "body"], Field(exclude_if=lambda x: x == "world")] = "world"
     reference: Annotated[Reference | None, Field(exclude_if=lambda x: x is None)] = None  # to track, in training
-    # Times ahead at which the policy is given the reference's velocity. As `vehicle.Later`.
+    # Times ahead at which the policy is given the reference's velocity. As `specfile.later`.
     preview_s: Annotated[tuple[Positive, ...], Field(max_length=8, exclude_if=lambda x: x == ())] = ()
     start: FlightStart  # from the hover point, the circle's center, or the reference
     envelope: FlightStart = ENVELOPE  # starts that an exported policy is calibrated for
@@ -240,7 +240,17 @@ class QuadrotorTask(Spec):
 
     def warnings(self) -> list[str]:
         """What is accepted and may not work, in one line each."""
-        return [f"vehicle: {text}" for text in self.vehicle.warnings()]
+        lag = self.lag_not_trained
+        return [
+            *(f"vehicle: {text}" for text in self.vehicle.warnings()),
+            *([f"{lag}: no policy that is trained so has met it"] if lag else []),
+        ]
+
+    @property
+    def lag_not_trained(self) -> str | None:
+        """Why a policy trained on this task has not met its vehicle's own lag, in one line; None: it has."""
+        own_s = self.vehicle.rotor_rise_s, self.vehicle.rotor_fall_s
+        return self.uncertainty.excludes_lag(own_s) if self.uncertainty else None
 
 
 class PendulumStart(Spec):

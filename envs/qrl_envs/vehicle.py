@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.specfile import NonNegative, Positive, Real, Spec
+from qrl_envs.specfile import NonNegative, Positive, Real, Spec, later
 
 STANDARD_GRAVITY_M_S2 = 9.81
 INERTIA_TOLERANCE = 0.05  # measured inertias are rounded: excess over a rigid body's bound that is accepted
@@ -16,11 +16,6 @@ LEAST_YAW_ACCELERATION_RAD_S2 = 0.3
 RECOVERY_M = 2.0
 LEAST_AXIS = 1e-3  # length
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover
-
-
-def _later(default: Any) -> Any:
-    """A field that came after the first runs: where it says nothing new it is not written; so fingerprints stay."""
-    return Field(default=default, exclude_if=lambda value: value == default)
 
 
 def _moments(inertia: tuple[float, ...]) -> tuple[float, ...]:
@@ -35,10 +30,10 @@ class Motor(Spec):
     position_m: Annotated[
         tuple[Real, ...], Field(min_length=2, max_length=3)
     ]  # x, y (, z) from the center of mass, body frame
-    axis: tuple[Real, Real, Real] = _later((0.0, 0.0, 1.0))  # direction of its thrust, body frame, of any length
+    axis: tuple[Real, Real, Real] = later((0.0, 0.0, 1.0))  # direction of its thrust, body frame, of any length
     spin: Literal[1, -1]  # +1: the motor's reaction torque is positive about its axis
     max_N: Positive
-    min_N: NonNegative = _later(0.0)
+    min_N: NonNegative = later(0.0)
 
     @model_validator(mode="after")
     def _limits(self) -> "Motor":
@@ -56,7 +51,7 @@ class Vehicle(Spec):
     speed follows its set-point with that time constant, and thrust is a curve of speed.
     """
 
-    source: str = _later("")  # where the numbers are from
+    source: str = later("")  # where the numbers are from
     mass_kg: Positive
     # About the center of mass, body axes: xx, yy, zz, or xx, yy, zz, xy, xz, yz (the products as they stand in the
     # matrix, so xy is −∫xy dm).
@@ -64,12 +59,12 @@ class Vehicle(Spec):
     motors: Annotated[tuple[Motor, ...], Field(min_length=3, max_length=8)]
     yaw_moment_m: Positive  # reaction torque per thrust: N m per N
     action_scale_N: Positive  # F_pi = action_scale_N · a
-    rotor_rise_s: NonNegative = _later(0.0)  # time constant of a rotor's speed when it is to rise
-    rotor_fall_s: NonNegative = _later(0.0)
-    thrust_curve: Annotated[float, Field(ge=-0.9, le=1.0)] = _later(
+    rotor_rise_s: NonNegative = later(0.0)  # time constant of a rotor's speed when it is to rise
+    rotor_fall_s: NonNegative = later(0.0)
+    thrust_curve: Annotated[float, Field(ge=-0.9, le=1.0)] = later(
         0.0
     )  # c of thrust/max_N = c·w + (1 − c)·w², w the speed
-    drag_N_s_m: tuple[NonNegative, NonNegative, NonNegative] = _later((0.0, 0.0, 0.0))  # linear, along body x, y, z
+    drag_N_s_m: tuple[NonNegative, NonNegative, NonNegative] = later((0.0, 0.0, 0.0))  # linear, along body x, y, z
 
     @model_validator(mode="after")
     def _can_fly(self) -> "Vehicle":

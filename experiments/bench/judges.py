@@ -196,10 +196,7 @@ def ours(vehicle: Vehicle, given: Given, drag: bool) -> State:
         rotors=rotors.rotors(vehicle),
         disturbance=Disturbance(jnp.asarray(vehicle.drag_N_s_m) * drag, none, none, none),
         latency_s=zero,
-        noise=plant.Noise(zero, zero, zero, zero),
-        position_bias_m=none,
-        noise_row=zero,
-        noise_stride=zero,
+        sensors=plant.Sensors(plant.Noise(zero, zero, zero, zero), none, zero, zero),
     )
 
     def one(body: Body, thrusts: jax.Array) -> Body:
@@ -207,7 +204,7 @@ def ours(vehicle: Vehicle, given: Given, drag: bool) -> State:
             flight = plant.step(flight, quadrotor.applied_action(physics, thrust), None, PERIOD_S)
             return flight, flight.body
 
-        return jax.lax.scan(step, plant.begin(body, world, 1, None, PERIOD_S), thrusts)[1]
+        return jax.lax.scan(step, plant.begin(body, world, plant.Layout(1, 0, gusts=False), None, PERIOD_S), thrusts)[1]
 
     quaternion, position, velocity, rate = (jnp.asarray(a, jnp.float32) for a in given.starts)
     bodies = Body(Pose(position, quaternion), Twist(velocity, rate))

@@ -25,9 +25,14 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("name", "vehicle"), [*CASES, ("hover", "tilted")])
+@pytest.mark.parametrize(("name", "vehicle"), [*CASES, ("hover", "tilted"), ("hover", "shaken")])
 def test_lanes_along_the_last_axis_step_as_each_by_itself(name: str, vehicle: str | None, tmp_path: Path) -> None:
-    """Values and gradients; "tilted": a full inertia, and motors along axes of their own."""
+    """Values and gradients; "tilted": a full inertia, and motors along axes of their own; "shaken": gusts and fixes."""
+    uncertainty = None
+    if vehicle == "shaken":
+        vehicle, uncertainty = "crazyflie", str(tmp_path / "shaken.json")
+        ranges = {"gust_m_s": [0.5, 1.0], "position_period_s": [0.0, 0.03], "bias_wander_m": [0.0, 0.01]}
+        Path(uncertainty).write_text(json.dumps(ranges))
     if vehicle == "tilted":
         data = task.load("hover", "crazyflie").model_dump(mode="json")["vehicle"]
         data["inertia_kg_m2"] = [*data["inertia_kg_m2"], 1e-7, 0.0, -1e-7]
@@ -36,7 +41,7 @@ def test_lanes_along_the_last_axis_step_as_each_by_itself(name: str, vehicle: st
             motor["axis"] = [1.5 * x, 1.5 * y, 1.0]
         vehicle = str(tmp_path / "tilted.json")
         Path(vehicle).write_text(json.dumps(data))
-    world = from_task(task.load(name, vehicle))
+    world = from_task(task.load(name, vehicle, uncertainty))
     states = jax.jit(jax.vmap(world.reset))(jax.random.split(jax.random.PRNGKey(0), 5))
     actions = jax.random.uniform(jax.random.PRNGKey(1), (5, world.action_size), minval=-1.2, maxval=1.2)
 

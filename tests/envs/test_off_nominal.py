@@ -58,7 +58,9 @@ def test_conditions_start_as_the_task_does() -> None:
 def test_one_program_serves_all_conditions() -> None:
     """Their parameters have one structure, and each changes what it says."""
     for spec in (HOVER, REAL):
-        named = {name: OffNominal(spec, c).params for name, c in off_nominal.conditions(spec).items()}
+        envs = {name: c.environment(spec) for name, c in off_nominal.conditions(spec).items()}
+        assert {name for name, env in envs.items() if type(env) is not OffNominal} == {"double_rate"}  # its own program
+        named = {name: env.params for name, env in envs.items() if type(env) is OffNominal}
         shapes = {str(jax.tree.map(jnp.shape, params)) for params in named.values()}
         assert len(shapes) == 1
         if spec is REAL:
@@ -79,12 +81,46 @@ def test_the_papers_trial_starts_anyhow_but_there() -> None:
 
 def test_the_conditions_are_those_that_a_policy_is_judged_by() -> None:
     """One change each, all but "together"; the trial is a hover's, wind that of a vehicle with drag."""
-    nothing = Uncertainty().model_dump()
+    nothing = Uncertainty()
     for spec in (HOVER, REAL, quadrotor_task("circle")):
         for name, condition in off_nominal.conditions(spec).items():
-            changed = [key for key, value in condition.uncertainty.model_dump().items() if value != nothing[key]]
-            if name not in ("together", "noise"):
-                assert len(changed) == (name not in ("exact", "trial")), name
+            fields = Uncertainty.model_fields
+            changed = {key for key in fields if getattr(condition.uncertainty, key) != getattr(nothing, key)}
+            several = {
+                "together": changed,
+                "noise": set(NOISE),
+                "gusts": {"gust_m_s"},
+                "estimator": {"position_period_s", "position_delay_s", "bias_wander_m"},
+            }
+            if name in several:
+                assert changed == several[name]
+            else:
+                assert len(changed) == (name not in ("exact", "trial", "half_rate", "double_rate")), name
     names = [set(off_nominal.conditions(spec)) for spec in (HOVER, REAL, quadrotor_task("circle"))]
     assert names[1] - names[0] == {"lag_x2", "wind"}
     assert names[0] - names[2] == {"trial"}
+
+
+def test_the_policys_rate_is_halved_and_doubled() -> None:
+    """Half: each action acts for two periods, whatever the policy says in the second. Double: twice as many shorter
+    periods, of which two have the reward of one.
+    """
+    named = off_nominal.conditions(REAL)
+    half, plain = (named[name].environment(REAL) for name in ("half_rate", "exact"))
+    actions = jnp.asarray(np.random.default_rng(0).uniform(-0.3, 0.3, (6, 4)), jnp.float32)
+
+    @jax.jit
+    def after(params: off_nominal.OffNominalParams, actions: jax.Array) -> jax.Array:
+        env = plain.with_params(params)  # pyright: ignore[reportArgumentType]
+        start = env.reset(jax.random.PRNGKey(3))
+        return jax.lax.scan(lambda s, a: (env.step(s, a), None), start, actions)[0].obs
+
+    held = after(half.params, actions)
+    np.testing.assert_allclose(held, after(plain.params, jnp.repeat(actions[::2], 2, axis=0)), atol=1e-6)
+    assert jnp.abs(held - after(plain.params, actions)).max() > 0.1
+    double = named["double_rate"].environment(REAL)
+    assert double.control_period_s == REAL.control_period_s / 2
+    plan, own = double.evaluation(), plain.evaluation()
+    assert (plan.steps, plan.return_steps) == (2 * own.steps, 2 * own.return_steps)
+    start = jax.eval_shape(double.reset, jax.random.PRNGKey(0))
+    assert start.obs.shape == jax.eval_shape(plain.reset, jax.random.PRNGKey(0)).obs.shape

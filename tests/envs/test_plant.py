@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from test_quadrotor import flat, newton_euler
 
 from qrl.export.policy import BodyFrame
-from qrl_envs import plant, quadrotor, rotors, task
+from qrl_envs import noise, plant, quadrotor, rotors, task
 from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.uncertainty import Uncertainty
 
@@ -154,7 +154,7 @@ def test_draws_fill_their_ranges_and_nothing_else_differs() -> None:
         (world.rotors.rise_s, 0.036, 0.108),
         (np.linalg.norm(world.disturbance.force_N, axis=1) / weight, 0.0, 0.2),
         (world.latency_s, 0.0, 0.02),
-        (world.noise.body_rate_rad_s, 0.01, 0.02),
+        (world.sensors.noise.body_rate_rad_s, 0.01, 0.02),
     ):
         assert stats.kstest(found, stats.uniform(low, width).cdf).pvalue > 1e-3
     force = world.disturbance.force_N / np.linalg.norm(world.disturbance.force_N, axis=1, keepdims=True)
@@ -162,7 +162,7 @@ def test_draws_fill_their_ranges_and_nothing_else_differs() -> None:
         assert stats.kstest(axis, stats.uniform(-1.0, 2.0).cdf).pvalue > 1e-3
     np.testing.assert_array_equal(world.physics.inertia_kg_m2, np.tile(physics.inertia_kg_m2, (4000, 1)))
     np.testing.assert_array_equal(world.motor_factor, 1.0)
-    np.testing.assert_array_equal(world.noise.position_m, 0.0)
+    np.testing.assert_array_equal(world.sensors.noise.position_m, 0.0)
     np.testing.assert_array_equal(world.rotors.rise_s, world.rotors.fall_s)
 
 
@@ -214,7 +214,7 @@ def test_sensors_err_by_their_sizes() -> None:
     scaled = errors / np.repeat([0.01, 0.02, 0.02, 0.01], 3)
     n = lanes * steps
     # The table of noise has 4,096 rows, of which several flights see the same: six sigmas of so many.
-    bound = 6 / np.sqrt(plant.NOISE_ROWS)
+    bound = 6 / np.sqrt(noise.ROWS)
     assert np.abs(scaled.mean(axis=(0, 1))).max() < bound
     together = np.einsum("lti,ltj->ij", scaled, scaled) / n
     assert np.abs(together - np.eye(12)).max() < np.sqrt(2) * bound

@@ -97,10 +97,11 @@ def test_a_real_vehicles_step_is_transformed_with_its_world(name: str, vehicle: 
     found = draws(env, DRAWS)
     keys = jax.random.split(jax.random.PRNGKey(0), DRAWS)
     flights = jax.jit(jax.vmap(env.reset))(keys).pipeline_state.x
-    silent = jax.tree.map(jnp.zeros_like, flights.world.noise)
+    sensors = flights.world.sensors
+    silent = sensors._replace(noise=jax.tree.map(jnp.zeros_like, sensors.noise))
     motors = flights.speed.shape[-1]
     flights = flights._replace(
-        world=flights.world._replace(noise=silent),
+        world=flights.world._replace(sensors=silent),
         speed=jnp.asarray(rng.uniform(0.2, 1.0, (DRAWS, motors)), jnp.float32),
         previous_action=jnp.asarray(rng.uniform(-1, 1, (DRAWS, motors)), jnp.float32),
         integral_m_s=jnp.asarray(rng.uniform(-0.5, 0.5, (DRAWS, 3)), jnp.float32),

@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -316,6 +317,31 @@ def test_what_can_only_just_fly_is_warned_about(path: Path) -> None:
         (warning,) = load(path, vehicle(changes)).warnings()
         assert words in warning
     assert task.load("hover").warnings() == []
+
+
+@pytest.mark.parametrize(
+    ("uncertainty", "words"),
+    [
+        ('{"rotor_lag_s": [0.0, 0.05]}', r"rotor_lag_s \[0, 0.05\] leaves out the vehicle's own lag of 72 ms"),
+        ('{"rotor_lag_s": [0.08, 0.2]}', "rotor_lag_s"),
+        ('{"rotor_lag_factor": [1.1, 2.0]}', "rotor_lag_factor"),
+        ('{"rotor_lag_s": [0.02, 0.072]}', None),
+        ('{"rotor_lag_factor": [0.6, 1.6]}', None),
+    ],
+)
+def test_a_lag_that_is_not_trained_with_is_warned_about(uncertainty: str, words: str | None, path: Path) -> None:
+    """The crazyflie's 72 ms; of the cf21_brushless both 57 and 62 ms count; a vehicle without lag has none."""
+    found = load(path, hover(f'"vehicle": "crazyflie", "uncertainty": {uncertainty}'))
+    assert isinstance(found, task.QuadrotorTask)
+    if words is None:
+        assert (found.warnings(), found.lag_not_trained) == ([], None)
+    else:
+        (warning,) = found.warnings()
+        assert re.search(words, warning)
+    between = load(path, hover('"vehicle": "cf21_brushless", "uncertainty": {"rotor_lag_s": [0.058, 0.07]}'))
+    assert "57 and 62 ms" in between.warnings()[0]
+    papers = load(path, hover('"uncertainty": {"rotor_lag_factor": [2.0, 3.0]}'))
+    assert papers.warnings() == []
 
 
 def test_hover_thrusts_balance_an_off_center_mass() -> None:

@@ -141,6 +141,25 @@ def test_only_static_values_make_programs(tmp_path: Path, axis: str, values: lis
     assert len(load(tmp_path, {"task": "hover", "axes": {axis: values}}).groups()) == programs
 
 
+def test_ranges_that_shape_a_flights_state_make_programs(tmp_path: Path) -> None:
+    """Gusts or none, fixes of another reach, more set-points that are late; other ranges travel. A range that came
+    later is no part of a record that says nothing of it, and can be set.
+    """
+    (tmp_path / "real.json").write_text('{"extend": "hover", "vehicle": "crazyflie"}')
+    for name, values, programs in (
+        ("mass_factor", [[1, 1], [1, 2]], 1),
+        ("gust_m_s", [[0, 1], [1, 2]], 1),
+        ("gust_m_s", [[0, 0], [1, 2]], 2),
+        ("position_period_s", [[0.02, 0.02], [0.0, 0.04]], 2),
+        ("latency_s", [[0, 0.005], [0, 0.008]], 1),
+        ("latency_s", [[0, 0.005], [0, 0.02]], 2),
+    ):
+        axes = {f"task.uncertainty.{name}": values}
+        found = load(tmp_path, {"task": str(tmp_path / "real.json"), "axes": axes})
+        assert len(found.groups()) == programs, name
+        assert [spec(p)["uncertainty"].get(name) or [0, 0] for p in found.points] == values
+
+
 def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -> None:
     """Null starts and rewards of an evaluation are those of training; ours, which say theirs, may train otherwise."""
     evaluation = {"start": None, "reward": None}

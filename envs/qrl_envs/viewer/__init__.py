@@ -219,7 +219,7 @@ def _quadrotor_panels(
         distance, band = error["position_m"], None
         label, speed = "speed", np.linalg.norm(observations[..., 12:15], axis=-1)
         limits = 0.0, _most(speed)
-    least = MIN_SHOWN * spec.distance_m
+    least = (0.1 if spec.reference else 1.0) * MIN_SHOWN * spec.distance_m
     rotor_speed = task.action == "rotor_speed"
     most = 1.0 if rotor_speed else max(motor.max_N for motor in task.vehicle.motors)
     acted = ("rotor speed, of its greatest", "rotor speed", "1") if rotor_speed else ("thrust", "thrust", "N")
@@ -235,7 +235,9 @@ def _quadrotor_panels(
             scale="log",
         ),
         Panel(
-            *(*acted, thrusts, _roomy(0.0, most)),
+            *acted,
+            lines=thrusts,
+            limits=_roomy(0.0, most),
             resolution=5e-4 * most,
             decimals=3 if most < 1.0 or rotor_speed else 2,
             held=True,

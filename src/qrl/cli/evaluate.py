@@ -11,6 +11,7 @@ from qrl import tasks
 from qrl.algorithm.flights import Flights, summarize
 from qrl.cli import tables
 from qrl.cli.terminal import DONE, console
+from qrl.cli.verdict import verdict
 from qrl.evaluation.baselines import CONTROLLERS, NOMINAL, Baselines, EvalEnvs
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import evaluation_starts
@@ -18,7 +19,7 @@ from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import checkpoint, files, record
 from qrl.runs.record import RunConfig
 from qrl_envs import measures
-from qrl_envs.off_nominal import Condition, OffNominal, conditions
+from qrl_envs.off_nominal import Condition, conditions
 from qrl_envs.plots import errors, off_nominal, settle
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task
@@ -50,7 +51,7 @@ def evaluate(args: argparse.Namespace) -> int:
     task = tasks.spec(config.task) if config.task.spec else None
     named = _conditions(args.run, config, task) if args.off_nominal else {}
     envs = {NOMINAL: tasks.environment(config.task)}
-    envs |= {name: OffNominal(task, condition) for name, condition in named.items()}  # pyright: ignore[reportArgumentType]
+    envs |= {name: condition.environment(task) for name, condition in named.items()}  # pyright: ignore[reportArgumentType]
     eval_envs = EvalEnvs(envs, evaluation_starts(args.starts))
     with ThreadPoolExecutor() as executor:
         seeds = _seed_runs(args.run, config, eval_envs, executor)
@@ -61,6 +62,7 @@ def evaluate(args: argparse.Namespace) -> int:
     parts = {"baselines": comparison.baselines, "beside": comparison.beside}
     table = [{**result, **{name: part for name, part in parts.items() if part}} for result, _ in results]
     for seed, result, (_, flights) in zip(seeds, table, results, strict=True):
+        result |= verdict(config.task, result["success"]).entry
         files.write_json(seed.folder / "evaluation.json", result)
         if task:
             _draw(seed.folder, task, flights, comparison)
@@ -185,3 +187,5 @@ def _print(table: list[dict[str, Any]], comparison: Comparison, named: dict[str,
     for name, result in policies.items():
         if "failures" in result:
             tables.failures(name, result)
+        if reason := result.get("reason"):
+            console.print(f"{name} does not do its task: {reason}")

@@ -103,7 +103,7 @@ def build_parser() -> _Parser:
         )
     for command in (evaluate, export):
         command.add_argument("--starts", type=count, default=1000, metavar="N", help="number of starts (default 1000)")
-    conditions = "also fly with RK4, latency, sensor noise; hover: the paper's trial"
+    conditions = "also fly with other lag, latency, mass, thrust, wind, gusts, sensors and control rate"
     evaluate.add_argument("--off-nominal", action="store_true", help=conditions)
     others = "other runs of the same task, a column each"
     evaluate.add_argument("--beside", type=Path, nargs="+", default=[], metavar="RUN", help=others)

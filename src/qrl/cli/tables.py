@@ -6,7 +6,7 @@ from typing import Any
 from qrl.cli.terminal import console
 from qrl.evaluation.starts import STARTS
 
-NOT_MEASURES = ("seed", "starts", "failed")
+NOT_MEASURES = ("seed", "starts", "failed", "flies")
 LISTED = 10  # failed starts
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from qrl import request, tasks
 from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, clock, console, print_error, progress_bar, stop_requested
+from qrl.cli.verdict import FLIES, verdict
 from qrl.config import Config
 from qrl.runs import files, record
 from qrl.runs.files import Row
@@ -23,7 +24,6 @@ from qrl.training import devices, loop, multihost
 from qrl_envs.specfile import BadInput
 
 PICTURE_FLIGHTS = 5
-FLIES = 0.99  # success from which a policy is said to do its task
 _HEADER = f"{'steps':>12} {'steps/s':>10} {'return':>20} {'success':>16} {'train time':>10} {'ETA':>6}"
 
 
@@ -161,7 +161,8 @@ def write_results(plan: Plan, finished: loop.Finished, seconds: float) -> None:
             shown = np.asarray(finished.flights.observations[i, :PICTURE_FLIGHTS])
             with files.writing(folder / "flight.png"):
                 flights.draw(folder / "flight.png", tasks.spec(config.task), shown)
-        summary = {"result": history[i][-1], "flies": flies(history[i][-1]), "command_seconds": round(seconds, 1)}
+        said = verdict(config.task, history[i][-1]["success"])
+        summary = {"result": history[i][-1], **said.entry, "command_seconds": round(seconds, 1)}
         files.write_json(folder / "summary.json", summary)
     if len(folders) > 1:
         title = f"{config.task.name}, {len(folders)} seeds"
@@ -176,13 +177,10 @@ def write_results(plan: Plan, finished: loop.Finished, seconds: float) -> None:
         files.write_json(out / "summary.json", {"seeds": spread, "command_seconds": round(seconds, 1)})
     console.print(f"done in {clock(seconds)}: {out}/summary.json, learning_curve.png; next: make evaluate RUN={out}")
     for i, rows in enumerate(history):
-        if flies(rows[-1]) is False:
+        if rows[-1]["success"] < FLIES:
             console.print(f"seed {config.seed + i} {_shortfall(rows[-1], config)}")
-
-
-def flies(last: Row) -> bool | None:
-    """Whether the last report's policy does its task from nearly every start; None where success is not measured."""
-    return None if np.isnan(last["success"]) else bool(last["success"] >= FLIES)
+        elif reason := verdict(config.task, rows[-1]["success"]).reason:
+            console.print(f"seed {config.seed + i} does not fly its vehicle: {reason}")
 
 
 def _shortfall(last: Row, run: RunConfig) -> str:

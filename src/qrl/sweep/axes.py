@@ -14,6 +14,7 @@ from qrl.config import Config
 from qrl.runs.record import TaskRecord
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput, Count, Real, Spec
+from qrl_envs.uncertainty import Uncertainty
 
 DIGITS = 6  # significant digits of the values of a range
 # Columns of results.csv, and prefixes of others: no axis may have such a name.
@@ -82,7 +83,11 @@ class Axis:
 
 def settable(task: TaskRecord) -> list[str]:
     """Settings that a grid may name: hyperparameters, and paths into the task's record."""
-    paths = [path for path in _paths(task.spec or {}, "task") if path != "task.description"]
+    spec = task.spec or {}
+    paths = [path for path in _paths(spec, "task") if path != "task.description"]
+    if "uncertainty" in spec:  # its record leaves out the ranges that came later and say nothing
+        added = (f"task.uncertainty.{name}" for name in Uncertainty.model_fields)
+        paths = list(dict.fromkeys((*paths, *added)))
     return [*Config.model_fields, *(path for path in paths if not path.startswith(EVALUATION))]
 
 
@@ -104,7 +109,7 @@ def put(spec: Any, path: list[str], value: Any) -> Any:
     first, *rest = path
     if isinstance(spec, list):
         return [put(inner, rest, value) if first in ("*", str(i)) else inner for i, inner in enumerate(spec)]
-    return {**spec, first: put(spec[first], rest, value)}
+    return {**spec, first: put(spec.get(first), rest, value)}
 
 
 def parse_axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) -> Axis:

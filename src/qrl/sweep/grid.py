@@ -18,6 +18,7 @@ from qrl.sweep.axes import Axis, check_names, parse_axis, put, settable
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.specfile import BadInput, Count, CountOrZero, Spec
+from qrl_envs.uncertainty import Uncertainty
 
 POINT_BYTES = 20_000  # of host memory for each point: read (6 kB measured), its arrays, its record in grid.json
 REPORT_BYTES = 3_000  # and for each report of a member: a row of some twenty numbers, once more as text
@@ -58,7 +59,10 @@ class GridPoint:
         spec = self.task.spec or {}
         fixed = {key: value for key, value in spec.items() if key not in (*task_spec.TRACED, "description", "preset")}
         form = spec.get("reward", {}).get("form")
-        return json.dumps([self.task.name, fixed, form, self.learner.static], sort_keys=True)
+        layout = None
+        if (uncertainty := spec.get("uncertainty")) is not None:
+            layout = specfile.build(Uncertainty, uncertainty, "uncertainty").layout(spec["control_period_s"])
+        return json.dumps([self.task.name, fixed, form, layout, self.learner.static], sort_keys=True)
 
     @property
     def evaluation_key(self) -> dict[str, Any]:
