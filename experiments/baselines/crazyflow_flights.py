@@ -24,7 +24,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import kernel_flights
-from kernel_flights import PERIOD_S, Array, Condition, Controller, KernelController, RaptorController, Rotors, State
+from kernel_flights import (
+    PERIOD_S,
+    Array,
+    Condition,
+    Controller,
+    KernelController,
+    RaptorController,
+    Rotors,
+    State,
+    Target,
+)
 
 FREQUENCY_HZ = 500
 HEIGHT_M = 1.5 * kernel_flights.LOST_M  # of the point: crazyflow has a floor at 0
@@ -148,14 +158,18 @@ def _one_each(rows: Array) -> Any:
 
 
 class Mellinger:
-    """crazyflow's own controller, with its gains and the mass that it assumes: it is passed the point alone."""
+    """crazyflow's own controller, with its gains and the mass that it assumes: it is passed position, velocity and
+    acceleration of what it is to follow.
+    """
 
     def reset(self, flights: int) -> None:
         pass
 
-    def act(self, states: State) -> Array:
+    def act(self, states: State, target: Target) -> Array:
         wanted = np.zeros(16)
-        wanted[2], wanted[12] = HEIGHT_M, 1.0  # position z; quaternion, w last
+        wanted[:3], wanted[3:6], wanted[6:9] = target.position_m, target.velocity_m_s, target.acceleration_m_s2
+        wanted[2] += HEIGHT_M
+        wanted[12] = 1.0  # the quaternion's w, which is last
         return np.tile(wanted, (len(states.position_m), 1))
 
 
@@ -185,7 +199,9 @@ def main() -> None:
         return
     controllers: dict[str, Controller] = {}
     if job.kernel:
-        controllers["qrl"] = KernelController(job.kernel, vehicle.rotors, vehicle.speed_of)
+        controllers["qrl"] = KernelController(
+            job.kernel, vehicle.rotors, vehicle.speed_of, vehicle.least_rpm, vehicle.most_rpm
+        )
     controllers["RAPTOR"] = RaptorController(vehicle.rotors, vehicle.least_rpm, vehicle.most_rpm)
     controllers["crazyflow's Mellinger"] = Mellinger()
     judges = {c: Flights(vehicle, job.starts, c) for c in (Control.rotor_vel, Control.state)}
@@ -193,7 +209,7 @@ def main() -> None:
     def judge(condition: Condition, name: str) -> Flights:
         return judges[Control.state if isinstance(controllers[name], Mellinger) else Control.rotor_vel].under(condition)
 
-    kernel_flights.tournament(judge, controllers, job.starts)
+    kernel_flights.tournament(judge, controllers, job.starts, job.references)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ RAPTOR_MOST_M, RAPTOR_MOST_M_S = 0.5, 1.0  # to which PX4's mc_raptor clips the 
 
 
 class State(NamedTuple):
-    """n rigid bodies; the position is relative to the point where they are to hover."""
+    """n rigid bodies; the position is relative to where the reference begins."""
 
     rotation: Array  # [n, 3, 3] body -> world
     position_m: Array  # [n, 3] world
@@ -74,12 +74,67 @@ class Simulator(Protocol):
         ...
 
 
+class Reference(NamedTuple):
+    """What is to be followed, at each control period from 0 on, and for a while after the flight."""
+
+    name: str
+    position_m: Array  # [K, 3] world
+    velocity_m_s: Array  # [K, 3] world
+    acceleration_m_s2: Array  # [K, 3] world
+    steps: int  # of a flight
+    tail: int  # of these, at the end, in which the error counts
+
+
+def _point() -> Reference:
+    steps = round(DURATION_S / PERIOD_S)
+    return Reference("hover", *np.zeros((3, steps + 1, 3)), steps, round(TAIL_S / PERIOD_S))
+
+
+HOVER = _point()
+
+
+class Target(NamedTuple):
+    """A reference at a step of a flight."""
+
+    reference: Reference
+    step: int
+
+    def ahead(self, periods: int) -> int:
+        return min(self.step + periods, len(self.reference.position_m) - 1)
+
+    @property
+    def position_m(self) -> Array:
+        return self.reference.position_m[self.ahead(0)]
+
+    @property
+    def velocity_m_s(self) -> Array:
+        return self.reference.velocity_m_s[self.ahead(0)]
+
+    @property
+    def acceleration_m_s2(self) -> Array:
+        return self.reference.acceleration_m_s2[self.ahead(0)]
+
+    def preview_m_s(self, periods: list[int]) -> Array:
+        """The velocities so many periods ahead minus that now, one after the other; [3k]."""
+        later = [self.reference.velocity_m_s[self.ahead(each)] - self.velocity_m_s for each in periods]
+        return np.concatenate([np.zeros(0), *later])
+
+
+def relative(states: State, target: Target) -> State:
+    """`states` with position and velocity relative to those of a target."""
+    return states._replace(
+        position_m=states.position_m - target.position_m, velocity_m_s=states.velocity_m_s - target.velocity_m_s
+    )
+
+
 class Controller(Protocol):
-    """From states to set-points of the rotors' speeds [n, N], in the judge's unit and order."""
+    """From states and what is to be followed to set-points of the rotors' speeds [n, N], in the judge's unit and
+    order.
+    """
 
     def reset(self, flights: int) -> None: ...
 
-    def act(self, states: State) -> Array: ...
+    def act(self, states: State, target: Target) -> Array: ...
 
 
 def motor_order(ours: Rotors, theirs: Rotors) -> NDArray[np.intp]:
@@ -113,8 +168,13 @@ class Kernel:
 
     def __init__(self, library: Path, manifest: Path) -> None:
         said = json.loads(manifest.read_text(encoding="utf-8"))
-        if said["format"] != 2 or len(said["obs"]) != 18 or any(port["unit"] != "N" for port in said["act"]):
-            raise ValueError(f"{manifest}: expected a kernel of format 2 from 18 measurements to thrusts in newtons")
+        units = {(port["unit"], port.get("quantity")) for port in said["act"]}
+        self.gives_speeds = units == {("1", "rotor speed fraction")}
+        if said["format"] != 2 or len(said["obs"]) < 18 or not (self.gives_speeds or units == {("N", None)}):
+            raise ValueError(
+                f"{manifest}: expected a kernel of format 2 from 18 measurements to thrusts or rotor speeds"
+            )
+        self._ahead = [round(port["ahead_s"] / PERIOD_S) for port in said["obs"][18::3]]
         if said["control_period_s"] != PERIOD_S:
             raise ValueError(f"{manifest}: expected a control period of {PERIOD_S} s")
         self.rotors = Rotors(
@@ -134,9 +194,10 @@ class Kernel:
         for memory in self._memories:
             self._reset(memory)
 
-    def thrusts_N(self, states: State) -> Array:
-        """[n, N], in the kernel's order."""
-        seen = np.ascontiguousarray(observations(states))
+    def actions(self, states: State, target: Target) -> Array:
+        """Thrusts [N], or rotor speeds of their greatest if it `gives_speeds`; [n, N] in the kernel's order."""
+        preview = np.tile(target.preview_m_s(self._ahead).astype(np.float32), (len(states.position_m), 1))
+        seen = np.ascontiguousarray(np.concatenate([observations(relative(states, target)), preview], axis=1))
         given = np.zeros((len(seen), len(self.rotors.spin)), np.float32)
         numbers = ctypes.POINTER(ctypes.c_float)
         for memory, row, out in zip(self._memories, seen, given, strict=True):
@@ -145,18 +206,21 @@ class Kernel:
 
 
 class KernelController:
-    """A kernel whose thrusts become set-points by the vehicle's nominal thrust curve."""
+    """A kernel whose thrusts become set-points by the vehicle's nominal thrust curve; speeds are set-points."""
 
-    def __init__(self, kernel: Kernel, theirs: Rotors, speed_of: Any) -> None:
-        """`speed_of`: thrust [N] -> rotor speed in the judge's unit, any shape."""
-        self._kernel, self._speed_of = kernel, speed_of
+    def __init__(self, kernel: Kernel, theirs: Rotors, speed_of: Any, least: float, most: float) -> None:
+        """`speed_of`: thrust [N] -> rotor speed in the judge's unit, any shape; `least`, `most`: in that unit."""
+        self._kernel, self._speed_of, self._limits = kernel, speed_of, (least, most)
         self._order = motor_order(kernel.rotors, theirs)
 
     def reset(self, flights: int) -> None:
         self._kernel.reset(flights)
 
-    def act(self, states: State) -> Array:
-        return self._speed_of(np.maximum(self._kernel.thrusts_N(states)[:, self._order], 0.0))
+    def act(self, states: State, target: Target) -> Array:
+        actions = self._kernel.actions(states, target)[:, self._order]
+        if self._kernel.gives_speeds:
+            return np.clip(actions * self._limits[1], *self._limits)
+        return self._speed_of(np.maximum(actions, 0.0))
 
 
 # Front right, back right, back left, front left; spins as those of the Crazyflies that it was trained on.
@@ -178,7 +242,8 @@ class RaptorController:
         self._policy.reset()
         self._previous = np.zeros((flights, 4))
 
-    def act(self, states: State) -> Array:
+    def act(self, states: State, target: Target) -> Array:
+        states = relative(states, target)
         seen = np.concatenate(
             [
                 np.clip(states.position_m, -RAPTOR_MOST_M, RAPTOR_MOST_M),
@@ -243,19 +308,26 @@ def any_attitude(count: int, seed: int = STARTS_SEED) -> Start:
 STARTS = {"moderate": moderate, "any attitude": any_attitude}
 
 
-def fly(simulator: Simulator, controller: Controller, starts: Start, duration_s: float = DURATION_S) -> Array:
-    """Distances from the point [n, steps] in meters after each period; infinite once lost."""
-    count = len(starts.quaternion)
-    simulator.start(starts.states())
+def fly(simulator: Simulator, controller: Controller, starts: Start, reference: Reference = HOVER) -> Array:
+    """Distances from the reference [n, steps] in meters after each period; infinite once lost. The starts are about
+    where it begins, and at its velocity.
+    """
+    count, origin = len(starts.quaternion), Target(reference, 0)
+    begun = starts.states()._replace(
+        position_m=starts.position_m + origin.position_m, velocity_m_s=starts.velocity_m_s + origin.velocity_m_s
+    )
+    simulator.start(begun)
     controller.reset(count)
     flying = np.ones(count, bool)
-    states, distances = starts.states(), []
+    states, distances = begun, []
     with np.errstate(all="ignore"):  # a lost flight may overflow
-        for _ in range(round(duration_s / PERIOD_S)):
-            simulator.step(controller.act(_level_where_lost(states, flying)), flying)
+        for step in range(reference.steps):
+            target = Target(reference, step)
+            simulator.step(controller.act(_level_where_lost(states, flying), target), flying)
             states = simulator.states()
-            distance = np.linalg.norm(states.position_m, axis=1)
-            rate = np.linalg.norm(states.body_rate_rad_s, axis=1)
+            error = relative(states, Target(reference, step + 1))
+            distance = np.linalg.norm(error.position_m, axis=1)
+            rate = np.linalg.norm(error.body_rate_rad_s, axis=1)
             flying &= (distance < LOST_M) & (rate < LOST_RAD_S)  # a NaN is not less
             distances.append(np.where(flying, distance, np.inf))
     return np.array(distances).T
@@ -267,13 +339,13 @@ def _level_where_lost(states: State, flying: NDArray[np.bool_]) -> State:
     return State(*(np.where(flying.reshape(-1, *[1] * (a.ndim - 1)), a, b) for a, b in zip(states, still, strict=True)))
 
 
-def summary(distances: Array) -> dict[str, float]:
+def summary(distances: Array, tail_steps: int = HOVER.tail) -> dict[str, float]:
     """Of flights [n, steps]: success, RMSE over the tail (median, [mm]) and time to settle (median, [s]).
 
     Success: within SUCCESS_M throughout the tail. RMSE and settle are infinite for a flight that was lost or did not
     settle, and enter the median so.
     """
-    tail = distances[:, -round(TAIL_S / PERIOD_S) :]
+    tail = distances[:, -tail_steps:]
     outside = ~(distances < SUCCESS_M)
     after = np.array([0.0 if not row.any() else (np.flatnonzero(row)[-1] + 1) * PERIOD_S for row in outside])
     settle = np.where(outside[:, -1], np.inf, after)
@@ -286,16 +358,26 @@ def summary(distances: Array) -> dict[str, float]:
 
 
 def tournament(
-    simulator: Callable[[Condition, str], Simulator], controllers: dict[str, Controller], starts: int
+    simulator: Callable[[Condition, str], Simulator],
+    controllers: dict[str, Controller],
+    starts: int,
+    references: list[Reference],
 ) -> None:
-    """Report a line for each kind of starts, condition and controller; `simulator`: of a condition and a controller."""
+    """Report a line for each reference, kind of starts, condition and controller; `simulator`: of a condition and a
+    controller. Figures are flown from moderate starts.
+    """
     from judge import report  # beside this file, where it is a script's; experiments.bench.judges needs no clock
 
-    for kind, draw in STARTS.items():
-        for condition in CONDITIONS:
-            for name, controller in controllers.items():
-                found = summary(fly(simulator(condition, name), controller, draw(starts)))
-                report({"starts": kind, "flights": starts, "condition": condition.name, "controller": name} | found)
+    for reference in references:
+        for kind, draw in STARTS.items():
+            if kind != "moderate" and reference.name != HOVER.name:
+                continue
+            for condition in CONDITIONS:
+                for name, controller in controllers.items():
+                    flown = fly(simulator(condition, name), controller, draw(starts), reference)
+                    said = {"reference": reference.name, "starts": kind, "flights": starts}
+                    said |= {"condition": condition.name, "controller": name}
+                    report(said | summary(flown, reference.tail))
 
 
 def _median(values: Array) -> float:
@@ -343,6 +425,23 @@ def read_rollouts(path: Path) -> dict[str, State]:
         return {v: State(*(stored[f"{v}/{name}"] for name in State._fields)) for v in variants}
 
 
+def write_references(path: Path, references: list[Reference]) -> None:
+    flat: dict[str, Any] = {}
+    for each in references:
+        flat |= {f"{each.name}/{name}": value for name, value in each._asdict().items() if name != "name"}
+    np.savez(path, **flat)
+
+
+def read_references(path: Path) -> list[Reference]:
+    with np.load(path) as stored:
+        found = []
+        for name in dict.fromkeys(key.split("/")[0] for key in stored.files):
+            arrays = (stored[f"{name}/{field}"] for field in Reference._fields[1:4])
+            counts = (int(stored[f"{name}/{field}"]) for field in Reference._fields[4:])
+            found.append(Reference(name, *arrays, *counts))
+        return found
+
+
 class Job(NamedTuple):
     """What a judge's script was asked for on its command line."""
 
@@ -351,20 +450,25 @@ class Job(NamedTuple):
     starts: int
     given: Path | None
     rollouts: Path | None
+    references: list[Reference]
 
 
 def job(vehicles: tuple[str, ...]) -> Job:
-    """Parse `SCRIPT VEHICLE [--kernel FOLDER] [--starts N] [--given FILE.npz --rollouts FILE.npz]`.
+    """Parse `SCRIPT VEHICLE [--kernel FOLDER] [--starts N] [--references FILE.npz] [--given FILE.npz --rollouts
+    FILE.npz]`.
 
-    FOLDER holds kernel.so and manifest.json; without it the other controllers fly alone. --given: fly nothing, but
+    FOLDER holds kernel.so and manifest.json; without it the other controllers fly alone. --references: what is to be
+    followed, by default a point. --given: fly nothing, but
     write to --rollouts where the judge's plant goes from its starts under its commands.
     """
     parser = argparse.ArgumentParser()
     parser.add_argument("vehicle", choices=vehicles)
     parser.add_argument("--kernel", type=Path)
     parser.add_argument("--starts", type=int, default=10)
+    parser.add_argument("--references", type=Path)
     parser.add_argument("--given", type=Path)
     parser.add_argument("--rollouts", type=Path)
     args = parser.parse_args()
     kernel = Kernel(args.kernel / "kernel.so", args.kernel / "manifest.json") if args.kernel else None
-    return Job(args.vehicle, kernel, args.starts, args.given, args.rollouts)
+    references = read_references(args.references) if args.references else [HOVER]
+    return Job(args.vehicle, kernel, args.starts, args.given, args.rollouts, references)

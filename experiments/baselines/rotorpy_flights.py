@@ -14,7 +14,17 @@ from rotorpy.vehicles.multirotor import Multirotor
 from scipy.spatial.transform import Rotation
 
 import kernel_flights
-from kernel_flights import PERIOD_S, Array, Condition, Controller, KernelController, RaptorController, Rotors, State
+from kernel_flights import (
+    PERIOD_S,
+    Array,
+    Condition,
+    Controller,
+    KernelController,
+    RaptorController,
+    Rotors,
+    State,
+    Target,
+)
 
 VEHICLES = {"crazyflie": crazyflie_params.quad_params, "hummingbird": hummingbird_params.quad_params}
 EXACT = {"method": "DOP853", "rtol": 1e-9, "atol": 1e-12}
@@ -101,21 +111,23 @@ class Flights:
 
 
 class SE3:
-    """rotorpy's geometric controller, with its gains, told the nominal vehicle."""
+    """rotorpy's geometric controller, with its gains, told the nominal vehicle; it is passed position, velocity and
+    acceleration of what it is to follow.
+    """
 
     def __init__(self, parameters: dict[str, Any]) -> None:
         self._controller = SE3Control(parameters)
-        self._wanted = {name: np.zeros(3) for name in ("x", "x_dot", "x_ddot", "x_dddot", "x_ddddot")}
-        self._wanted |= {"yaw": 0.0, "yaw_dot": 0.0}
 
     def reset(self, flights: int) -> None:
         pass
 
-    def act(self, states: State) -> Array:
+    def act(self, states: State, target: Target) -> Array:
+        wanted = {"x": target.position_m, "x_dot": target.velocity_m_s, "x_ddot": target.acceleration_m_s2}
+        wanted |= {"x_dddot": np.zeros(3), "x_ddddot": np.zeros(3), "yaw": 0.0, "yaw_dot": 0.0}
         quaternions = Rotation.from_matrix(states.rotation).as_quat()
         each = zip(states.position_m, states.velocity_m_s, quaternions, states.body_rate_rad_s, strict=True)
         now = (dict(zip("xvqw", values, strict=True)) for values in each)
-        return np.array([self._controller.update(0.0, state, self._wanted)["cmd_motor_speeds"] for state in now])
+        return np.array([self._controller.update(0.0, state, wanted)["cmd_motor_speeds"] for state in now])
 
 
 def main() -> None:
@@ -132,12 +144,14 @@ def main() -> None:
         found = {s: kernel_flights.rollout(f, given, theirs, speed_of) for s, f in flights.items()}
         kernel_flights.write_rollouts(job.rollouts, found)
         return
+    least, most = parameters["rotor_speed_min"], parameters["rotor_speed_max"]
     controllers: dict[str, Controller] = {}
     if job.kernel:
-        controllers["qrl"] = KernelController(job.kernel, theirs, speed_of)
-    least, most = parameters["rotor_speed_min"], parameters["rotor_speed_max"]
+        controllers["qrl"] = KernelController(job.kernel, theirs, speed_of, least, most)
     controllers |= {"RAPTOR": RaptorController(theirs, least, most), "rotorpy's SE3": SE3(parameters)}
-    kernel_flights.tournament(lambda condition, _: Flights(parameters, condition), controllers, job.starts)
+    kernel_flights.tournament(
+        lambda condition, _: Flights(parameters, condition), controllers, job.starts, job.references
+    )
 
 
 if __name__ == "__main__":

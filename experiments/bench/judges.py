@@ -1,9 +1,10 @@
 """Judges: simulators that no one here wrote fly the exported kernels: `make bench ARGS="--only judges"`.
 
-For each of a judge's vehicles: a hover policy is trained with our file of that vehicle and exported (or taken from
-`--runs`), and the kernel is flown in the judge's own environment by experiments/baselines/*_flights.py, beside RAPTOR
-and the judge's own controller, from the same starts. Before that our plant and the judge's go open loop from the same
-states under the same commands, the judge's one piece after the other, so that a difference is told apart by its cause.
+For each of a judge's vehicles: a policy of `--task` (hover; track; or any, which is trained once for all vehicles) is
+trained with our file of that vehicle and exported (or taken from `--runs`), and the kernel is flown in the judge's own
+environment by experiments/baselines/*_flights.py, beside RAPTOR and the judge's own controller, from the same starts.
+Before that our plant and the judge's go open loop from the same states under the same commands, the judge's one piece
+after the other, so that a difference is told apart by its cause.
 OUT/judges has judges.json, judges.md and a file for each vehicle, kept while nothing that it depends on changes.
 """
 
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.baselines import kernel_flights
-from experiments.baselines.kernel_flights import PERIOD_S, Given, Rotors, State
+from experiments.baselines.kernel_flights import PERIOD_S, Given, Reference, Rotors, State
 from experiments.bench.contestants import Contestant, key
 from experiments.bench.install import fingerprint
 from experiments.bench.process import run_with_timeout
@@ -31,6 +32,8 @@ from qrl.runs import files
 from qrl.runs import record as records
 from qrl_envs import plant, quadrotor, rotors
 from qrl_envs.quadrotor import Body, Disturbance, Pose, Twist
+from qrl_envs.reference import FixedReference, evaluation_s, reference_data
+from qrl_envs.specfile import build
 from qrl_envs.task import QuadrotorTask, load
 from qrl_envs.vehicle import Vehicle
 
@@ -64,29 +67,32 @@ class Difference(NamedTuple):
 
 
 def judge(contestants: list[Contestant], pythons: dict[str | None, Path], out: Path, starts: int, runs: dict[str, Path],
-          fresh: bool) -> None:  # fmt: skip
-    """Fly what is missing or stale, print its table, and write the files of OUT/judges.
+          fresh: bool, task: str = "hover") -> None:  # fmt: skip
+    """Fly what is missing or stale, print its table, and write the files of OUT/judges, or of OUT/judges_TASK.
 
-    `runs`: our vehicle's name -> the run folder of a hover policy, in place of one trained here.
+    `runs`: our vehicle's name -> the run folder of a policy of `task`, in place of one trained here.
     """
-    folder = out / "judges"
+    folder = out / ("judges" if task == "hover" else f"judges_{task}")
     folder.mkdir(parents=True, exist_ok=True)
     for contestant in contestants:
         if contestant.environment not in pythons:
             continue
         vehicle = VEHICLES[contestant.words[0]]
         try:
-            kernel = kernel_of(vehicle, runs.get(vehicle), folder / "kernels")
+            kernel = kernel_of(task, vehicle, runs.get(vehicle), folder / "kernels")
         except (subprocess.CalledProcessError, OSError) as error:
             print(f"{key(contestant)}: no kernel, and flown without: {error}", file=sys.stderr, flush=True)
             kernel = None
         path = folder / f"{key(contestant).split('/')[1]}.json"
-        made_from = inputs(contestant, kernel, starts)
+        made_from = inputs(contestant, kernel, starts, task)
         if not fresh and path.exists() and json.loads(path.read_text())["made_from"] == made_from:
             continue
         python = pythons[contestant.environment]
         compared = compare(contestant, python, vehicle, folder)
         words = ["--starts", str(starts), *(["--kernel", str(kernel.absolute())] if kernel else [])]
+        if task != "hover":
+            kernel_flights.write_references(folder / "references.npz", references())
+            words += ["--references", str((folder / "references.npz").absolute())]
         lines, outcome = fly(contestant, python, words)
         found = {
             "judge": contestant.environment,
@@ -107,8 +113,24 @@ def judge(contestants: list[Contestant], pythons: dict[str | None, Path], out: P
     print(f"{folder}/judges.json, judges.md")
 
 
-def kernel_of(vehicle: str, run: Path | None, folder: Path) -> Path:
-    """A folder with kernel.so and manifest.json of the hover policy of a vehicle: of `run`, else trained in `folder`.
+FIGURES = ("circle", "circle_fast", "eight_slow", "eight", "eight_fast")  # shipped references, beside a point
+
+
+def references() -> list[Reference]:
+    """A point and FIGURES at the control period, with a second after the flight's end."""
+    found = [kernel_flights.HOVER]
+    for name in FIGURES:
+        spec = build(FixedReference, reference_data(name), name)
+        duration_s, tail_s = evaluation_s(spec)
+        steps = round(duration_s / PERIOD_S)
+        sampled = spec.at(np.arange(steps + 100) * PERIOD_S)
+        found.append(Reference(name, *sampled, steps, round(tail_s / PERIOD_S)))
+    return found
+
+
+def kernel_of(task: str, vehicle: str, run: Path | None, folder: Path) -> Path:
+    """A folder with kernel.so and manifest.json of the policy of a task and a vehicle: of `run`, else trained in
+    `folder`.
 
     Raises CalledProcessError where training, export or compiler fail.
     """
@@ -117,14 +139,17 @@ def kernel_of(vehicle: str, run: Path | None, folder: Path) -> Path:
     def qrl(*words: str) -> None:
         subprocess.run([sys.executable, "-m", "qrl", *words], env=env, check=True)
 
+    for_all = task == "any"
+    vehicle = task if for_all else vehicle
     if run is None:
         run = folder / vehicle
         if not (run / "summary.json").exists():
             resume = ["--resume"] if run.exists() else []
-            qrl("train", "hover", "--vehicle", vehicle, "--seed", str(SEED), "--out", str(run), *resume)
+            own = [] if for_all else ["--vehicle", vehicle]
+            qrl("train", task, *own, "--seed", str(SEED), "--out", str(run), *resume)
     export = run / "export"
     if not (export / "manifest.json").exists():
-        qrl("export", str(run), "--name", "hover")
+        qrl("export", str(run), "--name", task)
     manifest = export / "manifest.json"
     built = folder / f"{vehicle}-built"
     built.mkdir(parents=True, exist_ok=True)
@@ -143,11 +168,12 @@ def manifest_of(kernel: Path | None) -> dict[str, Any] | None:
     return {name: said[name] for name in ("commit", "seed", "env_steps", "vehicle", "network")}
 
 
-def inputs(contestant: Contestant, kernel: Path | None, starts: int) -> dict[str, Any]:
+def inputs(contestant: Contestant, kernel: Path | None, starts: int, task: str) -> dict[str, Any]:
     """What the flights depend on: hashes of code, vehicle, requirements and kernel."""
     code = [BASELINES / contestant.script, Path(kernel_flights.__file__), Path(__file__), Path(plant.__file__)]
     shipped = load("hover", VEHICLES[contestant.words[0]]).model_dump_json()
     return {
+        "task": task,
         "starts": starts,
         "code": hashlib.sha256("".join([*(path.read_text() for path in code), shipped]).encode()).hexdigest(),
         "requirements": fingerprint(BASELINES / f"{contestant.environment}.txt"),
@@ -277,14 +303,15 @@ def section(result: dict[str, Any]) -> str:
         )
     if result["outcome"] != "done":
         parts.append(f"**The judge's process did not finish: {result['outcome']}.**")
-    for kind in dict.fromkeys(line["starts"] for line in lines):
-        selected = [line for line in lines if line["starts"] == kind]
+    for reference, kind in dict.fromkeys((line.get("reference", "hover"), line["starts"]) for line in lines):
+        selected = [line for line in lines if (line.get("reference", "hover"), line["starts"]) == (reference, kind)]
         conditions, controllers = (
             list(dict.fromkeys(line[name] for line in selected)) for name in ("condition", "controller")
         )
         cells = {(line["condition"], line["controller"]): cell(line) for line in selected}
         rows = [[name, *(cells.get((name, c), "") for c in controllers)] for name in conditions]
-        parts += [f"Starts: {kind}, {selected[0]['flights']} of them.", table(["", *controllers], rows)]
+        title = f"{reference}; starts: {kind}, {selected[0]['flights']} of them."
+        parts += [title[0].upper() + title[1:], table(["", *controllers], rows)]
     if result["plants"]:
         head = ["the judge's plant against ours", "after [s]", "position [mm]", "velocity [mm/s]", "attitude [°]"]
         rows = [
@@ -299,8 +326,9 @@ def page(results: list[dict[str, Any]]) -> str:
     """judges.md."""
     head = (
         "# Kernels in other people's simulators\n\n"
-        "A cell: RMSE of the position over the last 2 of 8 s, median over starts [mm]; flights that stay within 0.1 m"
-        " throughout those 2 s; time to settle, median [s]. –: no number, as most flights were lost or did not settle."
+        "A cell: RMSE of the position over the last 2 of 8 s, of a figure over whole laps after the first, median over"
+        " starts [mm]; flights that stay within 0.1 m throughout that; time to settle, median [s]."
+        " –: no number, as most flights were lost or did not settle."
         " Plants: open loop from the same states under the same commands; RMS over flights; each row of a judge adds to"
         " the one before."
     )

@@ -49,12 +49,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=5, metavar="N")
     parser.add_argument("--budget-seconds", type=float, default=150.0, help="time limit of one run", metavar="S")
     parser.add_argument("--starts", type=int, default=10, help="flights a cell of the judges", metavar="N")
+    parser.add_argument("--task", choices=("hover", "track", "any"), default="hover", help="of the judges' policies")
     parser.add_argument(
         "--runs",
         nargs="+",
         default=[],
         metavar="VEHICLE=FOLDER",
-        help="hover policies for the judges, in place of training them",
+        help="policies for the judges, in place of training them",
     )
     parser.add_argument("--fresh", action="store_true", help="repeat finished runs")
     parser.add_argument("--list", action="store_true", help="print the contestants and exit")
@@ -107,7 +108,7 @@ def bench(contestants: list[Contestant], args: argparse.Namespace) -> None:
         print(f"{args.out}/bench.json, bench.md, bench.png")
     if judges := [contestant for contestant in contestants if contestant.group == JUDGES]:
         runs = {vehicle: Path(run) for vehicle, run in args.runs.items()}
-        judge(judges, pythons, args.out, args.starts, runs, args.fresh)
+        judge(judges, pythons, args.out, args.starts, runs, args.fresh, args.task)
 
 
 def installed(

@@ -60,6 +60,56 @@ def test_a_lost_flight_is_no_success() -> None:
     assert kernel_flights.summary(np.full((1, 800), np.nan))["success"] == 0.0
 
 
+def test_a_controller_on_the_reference_has_no_error_and_sees_what_is_ahead(tmp_path: Path) -> None:
+    """A vehicle that is carried along each reference, as it is written and read: its distance stays 0."""
+    path = tmp_path / "references.npz"
+    kernel_flights.write_references(path, judges.references())
+    found = kernel_flights.read_references(path)
+    assert [each.name for each in found] == ["hover", *judges.FIGURES]
+    for reference in found:
+        seen: list[list[float]] = []
+        still = kernel_flights.Start(np.eye(4)[:1], *np.zeros((3, 1, 3)))
+        carried, watcher = Carried(reference), Watcher(seen)
+        distances = kernel_flights.fly(carried, watcher, still, reference)
+        assert distances.shape == (1, reference.steps)
+        assert distances.max() < 1e-12
+        np.testing.assert_allclose(np.array(seen)[:, :6], 0.0, atol=1e-12)
+        velocity = reference.velocity_m_s
+        np.testing.assert_allclose(seen[7][6:], velocity[57] - velocity[7])
+
+
+class Carried:
+    """A vehicle that is where the reference is."""
+
+    def __init__(self, reference: kernel_flights.Reference) -> None:
+        self._reference, self._at = reference, 0
+
+    def start(self, states: State) -> None:
+        np.testing.assert_allclose(states.position_m, self._reference.position_m[:1])
+
+    def states(self) -> State:
+        here = self._reference.position_m[[self._at]], self._reference.velocity_m_s[[self._at]]
+        return State(np.eye(3)[None], *here, np.zeros((1, 3)))
+
+    def step(self, set_points: np.ndarray, flying: np.ndarray) -> None:
+        self._at += 1
+
+
+class Watcher:
+    """A controller that notes the errors and the preview of 0.5 s."""
+
+    def __init__(self, seen: list[list[float]]) -> None:
+        self._seen = seen
+
+    def reset(self, flights: int) -> None:
+        pass
+
+    def act(self, states: State, target: kernel_flights.Target) -> np.ndarray:
+        error = kernel_flights.relative(states, target)
+        self._seen.append([*error.position_m[0], *error.velocity_m_s[0], *target.preview_m_s([50])])
+        return np.zeros((1, 4))
+
+
 def test_our_plant_hovers_under_the_thrusts_of_hover() -> None:
     """In the frames and units of a judge's rollouts."""
     vehicle = judges.vehicle_of("crazyflie")
@@ -96,7 +146,7 @@ def test_a_judge_is_asked_once_and_its_lines_are_kept(tmp_path: Path, monkeypatc
         f"print(len(open({str(tmp_path / 'asked')!r}, 'a').write('x') * 'x'))\n"
     )
     monkeypatch.setattr(judges, "BASELINES", tmp_path)
-    monkeypatch.setattr(judges, "kernel_of", lambda vehicle, run, folder: None)
+    monkeypatch.setattr(judges, "kernel_of", lambda task, vehicle, run, folder: None)
     stub = Contestant("stub crazyflie", JUDGES, "stub.py", ("crazyflie",), "stub")
     for _ in range(2):
         judges.judge([stub], {"stub": Path(sys.executable)}, tmp_path / "out", 3, {}, fresh=False)
