@@ -260,7 +260,8 @@ class RealQuadrotorEnv(QuadrotorEnv):
     Observation: what a policy sees, [policy_observation_size]: the 18 numbers of `QuadrotorEnv` as measured, relative
     to the reference now if the task has one; the preview of it, [3] for each time ahead; then its memory, as the task
     has it: previous action [N], integral of the position error [3], on a circle [4]; then what only a critic may see
-    (`plant.privileged`). `info["true_obs"]` [18] is the body as it is. Action [N], as in `QuadrotorEnv`.
+    (`plant.privileged`). `info["true_obs"]` [18 and the preview] is the body as it is. Action [N], as in
+    `QuadrotorEnv`, or rotor speeds, from 0 for −1 to the greatest for 1.
     """
 
     def __init__(
@@ -298,7 +299,11 @@ class RealQuadrotorEnv(QuadrotorEnv):
         return self._with_truth(super()._reset(params, rng))
 
     def _with_truth(self, state: State) -> State:
-        return state.replace(info={**state.info, "true_obs": quadrotor.observe(self._error(state.pipeline_state.x))})
+        x: plant.Flight = state.pipeline_state.x
+        true, target = quadrotor.observe(self._error(x)), self._target(x.world, x.steps)
+        if target is not None:
+            true = jnp.concatenate([true, target.preview_m_s])
+        return state.replace(info={**state.info, "true_obs": true})
 
     def _error(self, x: plant.Flight) -> quadrotor.Body:
         """The body as it is, relative to the reference."""

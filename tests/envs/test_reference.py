@@ -180,6 +180,7 @@ def test_what_is_observed_is_relative_to_the_reference() -> None:
     then = env._reference.at(flight.world.reference, jnp.int32(1))
     error = later.body.pose.position_m - then.position_m
     np.testing.assert_allclose(after.info["true_obs"][9:12], error, atol=1e-6)
+    np.testing.assert_allclose(after.info["true_obs"][18:], then.preview_m_s, atol=1e-6)
     gate = (1 - jnp.sum(error**2) / 0.25) ** 2
     np.testing.assert_allclose(later.integral_m_s, 0.01 * gate * error, rtol=1e-4)
     (p, q), (w, omega) = later.body
