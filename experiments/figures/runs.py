@@ -79,7 +79,7 @@ def plan(*, fast: bool) -> list[RunSpec]:
     if fast:
         return [
             *found,
-            RunSpec("hover", "hover", "hover_fast", NO_APG, seeds),
+            RunSpec("hover", "hover", "hover_fast", NO_APG | {"num_timesteps": 384_000}, seeds),
             RunSpec("circle", "circle", "circle_fast", NO_APG | {"num_timesteps": 1_200_000}, seeds),
         ]
     return [
