@@ -45,6 +45,7 @@ class Ranges(NamedTuple):
     position_bias_m: chex.Array
     thrust_curve: chex.Array  # []
     drag_N_s_m: chex.Array  # [3]
+    drag_height_m: chex.Array  # []
 
 
 class Noise(NamedTuple):
@@ -84,7 +85,7 @@ def ranges(uncertainty: Uncertainty, vehicle: Vehicle) -> Ranges:
 
     data: dict[str, Any] = uncertainty.model_dump(exclude={"rotor_lag_factor", "rotor_lag_s"})
     data |= {"rotor_rise_s": lag(vehicle.rotor_rise_s), "rotor_fall_s": lag(vehicle.rotor_fall_s)}
-    data |= {"thrust_curve": vehicle.thrust_curve, "drag_N_s_m": vehicle.drag_N_s_m}
+    data |= {"thrust_curve": vehicle.thrust_curve, "drag_N_s_m": vehicle.drag_N_s_m, "drag_height_m": vehicle.drag_height_m}
     return Ranges(**{name: jnp.asarray(data[name], jnp.float32) for name in Ranges._fields})
 
 
@@ -125,6 +126,7 @@ def draw(ranges: Ranges, physics: Physics, u: chex.Array) -> World:
             wind_m_s=within(ranges.wind_m_s, u[7]) * jnp.stack([jnp.cos(wind), jnp.sin(wind), jnp.zeros_like(wind)]),
             force_N=force * own_weight_N * _direction(u[8:10]),
             torque_N_m=within(ranges.torque_share, u[10]) * roll * _direction(u[11:13]),
+            drag_height_m=ranges.drag_height_m,
         ),
         latency_s=within(ranges.latency_s, u[13]),
         noise=Noise(*(within(getattr(ranges, name), u[14 + i]) for i, name in enumerate(NOISES))),
@@ -209,16 +211,44 @@ def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s
     new = jnp.sum(jnp.where(ages == first, set_points, 0.0), axis=0)
     old = jnp.sum(jnp.where(ages == jnp.minimum(first + 1, set_points.shape[0] - 1), set_points, 0.0), axis=0)
 
+    body, speed = advance(world, flight.body, flight.speed, (old, new), late_s, dt_s)
+    steps = flight.steps + 1
+    sensed = sense(world, body, steps)
+    return Flight(
+        body=body,
+        speed=speed,
+        set_points=set_points,
+        world=world,
+        sensed=sensed,
+        previous_action=quadrotor.applied_action(physics, thrust),
+        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m, integrator, dt_s),
+        steps=steps,
+    )
+
+
+def advance(
+    world: World,
+    body: Body,
+    speed: chex.Array,
+    set_points: tuple[chex.Array, chex.Array],
+    late_s: chex.Array,
+    dt_s: float,
+) -> tuple[Body, chex.Array]:
+    """Body and rotor speeds [N] after a period in which the first of two set-points [N] acts for `late_s` [], and then
+    the second.
+    """
+    physics, (old, new) = world.physics, set_points
+
     def speed_at(time_s: chex.Array) -> chex.Array:
-        before = rotors.after(world.rotors, flight.speed, old, jnp.minimum(time_s, late_s))
+        before = rotors.after(world.rotors, speed, old, jnp.minimum(time_s, late_s))
         return rotors.after(world.rotors, before, new, jnp.maximum(time_s - late_s, 0.0))
 
     def thrust_at(time_s: float) -> chex.Array:
-        speed = speed_at(jnp.float32(time_s)) if time_s else flight.speed
-        return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, speed)
+        now = speed_at(jnp.float32(time_s)) if time_s else speed
+        return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, now)
 
     substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
-    body, short_s = flight.body, dt_s / substeps
+    short_s = dt_s / substeps
     for i in range(substeps):
         begin_s, middle_s = i * short_s, (i + 0.5) * short_s
         body = integrate.midpoint(
@@ -228,18 +258,7 @@ def step(flight: Flight, action: chex.Array, integrator: Integrator | None, dt_s
             short_s,
         )
         body = _renormalized(body)
-    steps = flight.steps + 1
-    sensed = sense(world, body, steps)
-    return Flight(
-        body=body,
-        speed=speed_at(jnp.float32(dt_s)),
-        set_points=set_points,
-        world=world,
-        sensed=sensed,
-        previous_action=quadrotor.applied_action(physics, thrust),
-        integral_m_s=integrated(flight.integral_m_s, sensed.pose.position_m, integrator, dt_s),
-        steps=steps,
-    )
+    return body, speed_at(jnp.float32(dt_s))
 
 
 def _renormalized(body: Body) -> Body:

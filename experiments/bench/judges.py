@@ -194,7 +194,9 @@ def ours(vehicle: Vehicle, given: Given, drag: bool) -> State:
         physics=physics,
         motor_factor=jnp.ones(len(vehicle.motors)),
         rotors=rotors.rotors(vehicle),
-        disturbance=Disturbance(jnp.asarray(vehicle.drag_N_s_m) * drag, none, none, none),
+        disturbance=Disturbance(
+            jnp.asarray(vehicle.drag_N_s_m) * drag, none, none, none, jnp.float32(vehicle.drag_height_m)
+        ),
         latency_s=zero,
         noise=plant.Noise(zero, zero, zero, zero),
         position_bias_m=none,
