@@ -2,9 +2,10 @@
 
     python -m experiments.nanobench DATASET OUT     # DATASET: the folder datasets/dataset of syediu/nanobench-iros2026
 
-Position and velocity are the motion capture's, attitude the onboard estimator's (the markers' frame jitters by a degree),
-body rates the gyro's. A motor's command is its PWM share of the battery's voltage, of a full battery's 4.2 V: what turns
-a brushed motor. A flight is kept from FLYING_M above the ground on, without its first and last second there.
+Position and velocity are the motion capture's, attitude the onboard estimator's (the markers' frame jitters by a
+degree), body rates the gyro's. A motor's command is its PWM share of the battery's voltage, of a full battery's 4.2 V:
+what turns a brushed motor. Motors are in the firmware's order, as in the vehicle cf2x_l250. A flight is
+kept from FLYING_M above the ground on, without its first and last second there.
 """
 
 import argparse

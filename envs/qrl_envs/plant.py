@@ -85,7 +85,7 @@ def ranges(uncertainty: Uncertainty, vehicle: Vehicle) -> Ranges:
 
     data: dict[str, Any] = uncertainty.model_dump(exclude={"rotor_lag_factor", "rotor_lag_s"})
     data |= {"rotor_rise_s": lag(vehicle.rotor_rise_s), "rotor_fall_s": lag(vehicle.rotor_fall_s)}
-    data |= {"thrust_curve": vehicle.thrust_curve, "drag_N_s_m": vehicle.drag_N_s_m, "drag_height_m": vehicle.drag_height_m}
+    data |= {name: getattr(vehicle, name) for name in ("thrust_curve", "drag_N_s_m", "drag_height_m")}
     return Ranges(**{name: jnp.asarray(data[name], jnp.float32) for name in Ranges._fields})
 
 

@@ -207,7 +207,7 @@ def test_torque_free_motion_keeps_momentum_and_energy(fly: Integrator, order: in
 
 @pytest.mark.parametrize("spec", [CROOKED, TILTED], ids=["crooked", "tilted"])
 def test_derivative_is_newton_euler(spec: Vehicle) -> None:
-    """In 50 random states under random thrusts, drag above the center of mass, wind, force and torque: all 18 rates of change."""
+    """In 50 random states under random thrusts, drag above the center of mass, wind, push: all 18 rates."""
     rng = np.random.default_rng(2)
     vehicle, body = physics(spec), bodies(rng, 50)
     thrust = rng.uniform(0.0, 5.0, size=(50, len(spec.motors)))

@@ -1,4 +1,4 @@
-"""Flights of a quadrotor simulated with NumPy alone, as logs for `qrl identify`: an oracle that shares no code with it."""
+"""Flights of a quadrotor simulated with NumPy alone, as logs for `qrl identify`: its oracle shares no code with it."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""`qrl identify` against flights that NumPy alone simulated (`flown_logs`): the numbers that flew are inside the intervals."""
+"""`qrl identify` against flights that NumPy alone simulated (`flown_logs`): what flew is inside the intervals."""
 
 import json
 from pathlib import Path

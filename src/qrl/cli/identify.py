@@ -18,7 +18,7 @@ from qrl_envs.specfile import BadInput
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle, vehicle_data, with_default_scale
 
 LEAST_SEGMENTS = 8
-MOST_SEGMENTS = 400  # that are fitted, evenly spaced: more narrow the intervals and take longer
+MOST_SEGMENTS = 350  # that are fitted, evenly spaced: more narrow the intervals and take longer
 WHOLE_FLIGHTS = 4  # logs from which on a share of the flights is of whole flights
 LEAST_SHARE, MOST_SHARE = 0.05, 0.8
 
@@ -41,8 +41,8 @@ def identify(args: argparse.Namespace) -> int:
     for name, segments in (("to fit", fitted_to), ("to hold out", unseen)):
         if len(segments.flight) < LEAST_SEGMENTS:
             raise BadInput(
-                f"{paths[0]}: expected at least {LEAST_SEGMENTS} segments of {flight_log.HORIZON_S:g} s {name}, without gaps"
-                f" and in the air, found {len(segments.flight)}"
+                f"{paths[0]}: expected at least {LEAST_SEGMENTS} segments of {flight_log.HORIZON_S:g} s {name}, without"
+                f" gaps and in the air, found {len(segments.flight)}"
             )
     console.print(f"{plural(len(fitted_to.flight), 'segment')} to fit, {len(unseen.flight):,} held out ({apart})")
     free = model.model(vehicle, logs[0].thrust, logs[0].period_s)
@@ -56,7 +56,7 @@ def identify(args: argparse.Namespace) -> int:
     _tell(free, fit, rows, summary)
     picture = args.plot or args.out.with_suffix(".png")
     files.write_json(args.out, data)
-    details: dict[str, Any] = {"held_out": {**summary, "of": apart}, "intervals": f"sandwich, by {fit.clusters}"}
+    details: dict[str, Any] = {"held_out": {**summary, "of": apart}, "intervals": "sandwich, by segments"}
     details |= {"explained": fit.explained, "parameters": [row._asdict() for row in rows]}
     beside = args.out.with_name(f"{args.out.stem}_report.json")
     files.write_json(beside, details)
@@ -103,7 +103,7 @@ def _split(logs: list[FlightLog], vehicle: Vehicle, given: int, share: float) ->
 
 def _tell(free: Model, fit: Fit, rows: list[report.Row], summary: dict[str, Any]) -> None:
     width = max(len(row.name) for row in rows)
-    console.print(f"\n{'':<{width}} {'start':>11} {'fitted':>11}   95 % interval (of {fit.units:,} {fit.clusters})")
+    console.print(f"\n{'':<{width}} {'start':>11} {'fitted':>11}   95 % interval")
     for row in rows:
         interval = row.kept or f"{row.low:.4g} to {row.high:.4g}"
         console.print(f"{row.name:<{width}} {row.start:>11.5g} {row.value:>11.5g}   {interval}")
@@ -115,12 +115,12 @@ def _tell(free: Model, fit: Fit, rows: list[report.Row], summary: dict[str, Any]
     console.print(f"a log tells thrust over mass only: {believed}")
     if fit.explained < fitting.LEAST_EXPLAINED:
         console.print(
-            f"commands explain {max(fit.explained, 0.0):.0%} of the change of body rates over 0.1 s: sampled more slowly than they"
-            " change? Inertia and yaw moment were fitted to predict, and are not the vehicle's"
+            f"commands explain {max(fit.explained, 0.0):.0%} of the change of body rates over 0.1 s: sampled more slowly"
+            " than they change? Inertia and yaw moment were fitted to predict, and are not the vehicle's"
         )
     ratio = "" if summary["ratio"] is None else f", ratio {summary['ratio']:.3f}"
     console.print(
-        f"\nheld out, {summary['horizon_s']:g} s open loop, median position error of {summary['segments']:,} segments: starting"
-        f" vehicle {summary['start_mm']:.1f} mm, fitted {summary['fitted_mm']:.1f} mm{ratio}"
+        f"\nheld out, {summary['horizon_s']:g} s open loop, median position error of {summary['segments']:,} segments:"
+        f" starting vehicle {summary['start_mm']:.1f} mm, fitted {summary['fitted_mm']:.1f} mm{ratio}"
         f" (its file alone: {summary['file_mm']:.1f} mm; constant velocity: {summary['constant_velocity_mm']:.1f} mm)"
     )

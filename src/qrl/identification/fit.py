@@ -19,7 +19,7 @@ OUTLIER = 2.0  # times the median error of segments, above which one counts line
 FIRST_LEADS = 3  # compared at first: later ones say little until the vehicle is nearly right
 ROUNDS, STEPS = 2, 8  # in which errors are rescaled; of Gauss–Newton, at most, in each
 LEAST_EXPLAINED = 0.8  # of the change of body rates by the commands, for a fitted inertia to be the vehicle's
-LEAST_FLIGHTS = 10  # from which on they are the units of the intervals, not segments
+TORQUE = ("inertia", "yaw_moment")  # which else is no more than what predicts the log
 # Half the width of a 95 % interval above which a parameter keeps the file's value. Factors by their logarithm.
 WIDE = {
     "curve": 0.25,
@@ -42,8 +42,6 @@ class Fit(NamedTuple):
     fitted: np.ndarray  # [P] bool
     half_width: np.ndarray  # [P] of the 95 % interval when last fitted; inf of what was not
     explained: float  # share of the change of body rates that the commands explain
-    clusters: str  # the units of the intervals: "flights" or "segments"
-    units: int  # how many
 
 
 class Program(NamedTuple):
@@ -82,7 +80,7 @@ def fit(
     """The parameters for which the plant flies `segments` as the log says, by Levenberg's and Marquardt's damped steps.
 
     Errors are weighted by their own size for each lead time and kind; the covariance is the sandwich estimate with
-    flights or segments as independent units (White; Liang and Zeger). What is wide by WIDE keeps its value in the file,
+    segments as independent units (White; Liang and Zeger). What is wide by WIDE keeps its value in the file,
     the widest first, and the others are fitted again.
     """
 
@@ -90,30 +88,28 @@ def fit(
     bound = _Bound(model, errors, jacobian)
     names, given = np.array(model.names), model.given
     active, first = model.free.copy(), np.where(names == "lag", 0.0, given)
-    flights, units = np.unique(segments.flight), segments.flight
-    clusters = "flights" if len(flights) >= LEAST_FLIGHTS else "segments"
-    if clusters == "segments":
-        units = np.arange(len(segments.flight))
     theta = first
     for leads in (FIRST_LEADS, FIRST_LEADS, None):
         theta, _ = _converged(bound, theta, active, leads)
     explained = _explained(errors(theta), segments, int(flight_log.leads(model.period_s)[1]))
     widths = np.full(len(theta), np.inf)
     limits = np.array([WIDE.get(name, np.inf) for name in names])
+    if explained < LEAST_EXPLAINED:
+        limits[np.isin(names, TORQUE)] = np.inf
     rounds, (low, high) = ROUNDS, model.bounds
     while True:
         weights = np.zeros(0)
         for _ in range(rounds):
             theta, weights = _converged(bound, theta, active, None)
-        covariance = _covariance(bound, theta, weights, active, units)
+        covariance = _covariance(bound, theta, weights, active)
         half = Z_95 * np.sqrt(np.diag(covariance))
         widths[active] = half[active]
         ratio = np.where(active, half / limits, 0.0)
         if not (wide := ratio > 1.0).any():
             # What the file takes over: latency is the log's, and so is inertia where it stands for noise of commands.
-            log_own = ["latency_s"] if explained >= LEAST_EXPLAINED else ["latency_s", "inertia", "yaw_moment"]
+            log_own = ["latency_s", *(TORQUE if explained < LEAST_EXPLAINED else ())]
             file = np.where(np.isin(names, log_own), given, theta)
-            return Fit(theta, file, covariance, active, widths, explained, clusters, len(np.unique(units)))
+            return Fit(theta, file, covariance, active, widths, explained)
         # What is no part of a vehicle first: latency and lag look alike where commands change slowly.
         latency = np.flatnonzero(wide & (names == "latency_s"))
         worst = int(latency[0] if len(latency) else np.argmax(ratio))
@@ -146,7 +142,7 @@ def _explained(errors: np.ndarray, segments: Segments, steps: int) -> float:
 def _converged(
     bound: _Bound, theta: np.ndarray, active: np.ndarray, leads: int | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Parameters after steps at fixed weights, and the weights [S, L, 12] of squared errors, of the first `leads` times."""
+    """Parameters after steps at fixed weights, and these, of squared errors: [S, L, 12], of the first `leads` times."""
     errors = bound.errors(theta)
     weights = _weights(errors, leads)
     low, high = bound.model.bounds
@@ -191,17 +187,14 @@ def _weights(errors: np.ndarray, leads: int | None) -> np.ndarray:
     return weights * np.minimum(1.0, limit / np.maximum(own, limit))[:, None, None]
 
 
-def _covariance(
-    bound: _Bound, theta: np.ndarray, weights: np.ndarray, active: np.ndarray, units: np.ndarray
-) -> np.ndarray:
-    """The sandwich estimate: curvature⁻¹ · (sum over units of slope·slopeᵀ) · curvature⁻¹; [P, P]."""
+def _covariance(bound: _Bound, theta: np.ndarray, weights: np.ndarray, active: np.ndarray) -> np.ndarray:
+    """The sandwich estimate: curvature⁻¹ · (sum over segments of slope·slopeᵀ) · curvature⁻¹; [P, P]."""
     curvature, _, each = _normal(bound.errors(theta), bound.jacobian(theta)[..., active], weights)
-    slopes = np.stack([each[units == unit].sum(axis=0) for unit in np.unique(units)])
     size = np.sqrt(np.maximum(np.diag(curvature), 1e-30))
     inverse = np.linalg.pinv(curvature / size / size[:, None], rcond=1e-12, hermitian=True) / size / size[:, None]
-    count = len(slopes)
+    count = len(each)
     covariance = np.zeros((len(active), len(active)))
-    covariance[np.ix_(active, active)] = count / max(count - 1, 1) * inverse @ slopes.T @ slopes @ inverse
+    covariance[np.ix_(active, active)] = count / max(count - 1, 1) * inverse @ each.T @ each @ inverse
     return covariance
 
 

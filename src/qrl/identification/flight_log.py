@@ -21,7 +21,7 @@ LEAD_S = 0.05  # between the times of a segment at which prediction and log are 
 
 
 class FlightLog(NamedTuple):
-    """A log on a grid of equal periods, T rows; SI units, world frame with z up, quaternions [w, x, y, z] body -> world."""
+    """A log on a grid of equal periods, T rows; SI units, world frame with z up, quaternions body -> world."""
 
     name: str
     period_s: float
@@ -223,7 +223,7 @@ def segments(
     logs: Sequence[FlightLog], weight_N: float, spans: Sequence[tuple[float, float]], static_N: Sequence[np.ndarray]
 ) -> Segments:
     """The segments of logs, end to end, within a span of each log's time (as fractions of it); without those that have
-    a gap, or in which the vehicle stands on the ground: at rest, with commands whose thrust at rest `static_N` (for each
+    a gap, or in which the vehicle stands on the ground: at rest, with commands whose steady thrust `static_N` (for each
     log [T]) is under half of its weight.
     """
     parts: list[Segments] = []

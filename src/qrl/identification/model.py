@@ -1,8 +1,8 @@
 """A vehicle with free parameters, flown open loop through the plant of `qrl_envs` from the states of a log.
 
-Thrust, mass, lag, inertia and yaw torque are free by the logarithm of a factor on the file's value, the others by what is
-added to it. A log alone tells forces over mass and torques over inertia. So where it gives rotor speeds, thrust is free
-and the mass is the file's; where it gives thrusts, they are believed, and mass and center of mass are free.
+Thrust, mass, lag, inertia and yaw moment are free by the logarithm of a factor on the file's value, the others by what
+is added to it. A log alone tells forces over mass and torques over inertia. So where it gives rotor speeds, thrust is
+free and the mass is the file's; where it gives thrusts, they are believed, and mass and center of mass are free.
 """
 
 from typing import Any, NamedTuple
@@ -207,9 +207,9 @@ def _body(state: chex.Array) -> Body:
 
 
 def found_errors(model: Model, theta: chex.Array, segments: Segments) -> chex.Array:
-    """What a fit makes small, [S, L, 12]: errors of position and velocity with the log's attitude, and of attitude and body
-    rates. So what the log says of the motors' thrust is not drowned by its errors in torque, which position integrates
-    four times.
+    """What a fit makes small, [S, L, 12]: errors of position and velocity with the log's attitude, of attitude and body
+    rates without. So what the log says of thrust is not drowned by errors in torque, which position integrates four
+    times.
     """
     at = flight_log.leads(model.period_s)
     measured = jnp.asarray(segments.measured)[:, at]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from qrl.identification.fit import LEAST_EXPLAINED, Z_95, Fit, HeldOut
+from qrl.identification.fit import LEAST_EXPLAINED, TORQUE, Z_95, Fit, HeldOut
 from qrl.identification.model import NO_LAG_S, Model
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput
@@ -32,7 +32,7 @@ def rows(model: Model, fit: Fit) -> list[Row]:
     def row(name: str, start: float, weights: np.ndarray, scale: float | None = None) -> Row:
         """Of a combination of parameters: what is added to `start` by `scale`, or the logarithm of its factor."""
         parts = np.flatnonzero(weights)
-        fitted = bool(fit.fitted[parts].any()) and not (poor and {*names[parts]} <= {"inertia", "yaw_moment"})
+        fitted = bool(fit.fitted[parts].any()) and not (poor and {*names[parts]} <= {*TORQUE})
         offset, half = float(weights @ fit.theta), Z_95 * float(np.sqrt(weights @ fit.covariance @ weights))
         ends = np.array([offset, offset - half, offset + half])
         if scale is None:
@@ -70,7 +70,7 @@ def rows(model: Model, fit: Fit) -> list[Row]:
 
 def _why(model: Model, fit: Fit, parts: np.ndarray) -> str:
     if fit.fitted[parts].any():
-        return f"kept: commands explain {max(fit.explained, 0.0):.0%} of the change of body rates, so what was found is the log's"
+        return f"kept: what was found is the log's (commands explain {max(fit.explained, 0.0):.0%} of the rotation)"
     return "kept: the log leaves it open (its 95 % interval was wide)"
 
 
