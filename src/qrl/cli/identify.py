@@ -17,7 +17,7 @@ from qrl_envs import specfile
 from qrl_envs.specfile import BadInput
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle, vehicle_data, with_default_scale
 
-LEAST_SEGMENTS = 8
+LEAST_TO_FIT, LEAST_HELD_OUT = 8, 3  # segments
 MOST_SEGMENTS = 350  # that are fitted, evenly spaced: more narrow the intervals and take longer
 WHOLE_FLIGHTS = 4  # logs from which on a share of the flights is of whole flights
 LEAST_SHARE, MOST_SHARE = 0.05, 0.8
@@ -38,10 +38,10 @@ def identify(args: argparse.Namespace) -> int:
             console.print(
                 f"{log.name}: no {' and '.join(log.estimated)} logged: from slopes over {flight_log.SMOOTHING_S:g} s"
             )
-    for name, segments in (("to fit", fitted_to), ("to hold out", unseen)):
-        if len(segments.flight) < LEAST_SEGMENTS:
+    for name, segments, least in (("to fit", fitted_to, LEAST_TO_FIT), ("to hold out", unseen, LEAST_HELD_OUT)):
+        if len(segments.flight) < least:
             raise BadInput(
-                f"{paths[0]}: expected at least {LEAST_SEGMENTS} segments of {flight_log.HORIZON_S:g} s {name}, without"
+                f"{paths[0]}: expected at least {least} segments of {flight_log.HORIZON_S:g} s {name}, without"
                 f" gaps and in the air, found {len(segments.flight)}"
             )
     console.print(f"{plural(len(fitted_to.flight), 'segment')} to fit, {len(unseen.flight):,} held out ({apart})")
@@ -115,7 +115,7 @@ def _tell(free: Model, fit: Fit, rows: list[report.Row], summary: dict[str, Any]
     console.print(f"a log tells thrust over mass only: {believed}")
     if fit.explained < fitting.LEAST_EXPLAINED:
         console.print(
-            f"commands explain {max(fit.explained, 0.0):.0%} of the change of body rates over 0.1 s: sampled more slowly"
+            f"commands explain {max(fit.explained, 0.0):.0%} of the change of body rates over 0.1 s: sampled slower"
             " than they change? Inertia and yaw moment were fitted to predict, and are not the vehicle's"
         )
     ratio = "" if summary["ratio"] is None else f", ratio {summary['ratio']:.3f}"

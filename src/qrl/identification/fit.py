@@ -18,6 +18,7 @@ FLOORS = np.repeat([2e-4, 2e-4, 2e-3, 2e-3], 3)  # least scales of errors [m, ra
 OUTLIER = 2.0  # times the median error of segments, above which one counts linearly, not by its square
 FIRST_LEADS = 3  # compared at first: later ones say little until the vehicle is nearly right
 ROUNDS, STEPS = 2, 8  # in which errors are rescaled; of Gauss–Newton, at most, in each
+ENOUGH = 1e-3  # share of its squares that a step must take away for another to follow
 LEAST_EXPLAINED = 0.8  # of the change of body rates by the commands, for a fitted inertia to be the vehicle's
 TORQUE = ("inertia", "yaw_moment")  # which else is no more than what predicts the log
 # Half the width of a 95 % interval above which a parameter keeps the file's value. Factors by their logarithm.
@@ -89,7 +90,7 @@ def fit(
     names, given = np.array(model.names), model.given
     active, first = model.free.copy(), np.where(names == "lag", 0.0, given)
     theta = first
-    for leads in (FIRST_LEADS, FIRST_LEADS, None):
+    for leads in (FIRST_LEADS, None):
         theta, _ = _converged(bound, theta, active, leads)
     explained = _explained(errors(theta), segments, int(flight_log.leads(model.period_s)[1]))
     widths = np.full(len(theta), np.inf)
@@ -101,8 +102,7 @@ def fit(
         weights = np.zeros(0)
         for _ in range(rounds):
             theta, weights = _converged(bound, theta, active, None)
-        covariance = _covariance(bound, theta, weights, active)
-        half = Z_95 * np.sqrt(np.diag(covariance))
+        covariance, half = _covariance(bound, theta, weights, active)
         widths[active] = half[active]
         ratio = np.where(active, half / limits, 0.0)
         if not (wide := ratio > 1.0).any():
@@ -115,6 +115,8 @@ def fit(
         worst = int(latency[0] if len(latency) else np.argmax(ratio))
         report(f"{names[worst]}: its interval is wide (± {half[worst]:.2g}); the file's value stays")
         active[worst], rounds = False, 1
+        if names[worst] == "lag":
+            active[names == "rise"] = False  # a ratio to what is not known
         theta = np.where(active & (theta > low) & (theta < high), theta, first)
         theta[~active] = given[~active]
 
@@ -160,7 +162,7 @@ def _converged(
                 theta, cost, errors, damping = proposal, value, tried, max(damping / 10.0, 1e-9)
                 break
             damping *= 10.0
-        if before - cost < 1e-4 * before:
+        if before - cost < ENOUGH * before:
             break
     return theta, weights
 
@@ -187,15 +189,22 @@ def _weights(errors: np.ndarray, leads: int | None) -> np.ndarray:
     return weights * np.minimum(1.0, limit / np.maximum(own, limit))[:, None, None]
 
 
-def _covariance(bound: _Bound, theta: np.ndarray, weights: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """The sandwich estimate: curvature⁻¹ · (sum over segments of slope·slopeᵀ) · curvature⁻¹; [P, P]."""
+def _covariance(
+    bound: _Bound, theta: np.ndarray, weights: np.ndarray, active: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The sandwich estimate: curvature⁻¹ · (sum over segments of slope·slopeᵀ) · curvature⁻¹; [P, P].
+    And half the widths of intervals [P], which are those of curvature⁻¹ where these are wider."""
     curvature, _, each = _normal(bound.errors(theta), bound.jacobian(theta)[..., active], weights)
     size = np.sqrt(np.maximum(np.diag(curvature), 1e-30))
-    inverse = np.linalg.pinv(curvature / size / size[:, None], rcond=1e-12, hermitian=True) / size / size[:, None]
+    values, vectors = np.linalg.eigh(curvature / size / size[:, None])
+    inverse = (vectors / np.maximum(values, 1e-10)) @ vectors.T / size / size[:, None]
     count = len(each)
     covariance = np.zeros((len(active), len(active)))
     covariance[np.ix_(active, active)] = count / max(count - 1, 1) * inverse @ each.T @ each @ inverse
-    return covariance
+    # Where nothing depends on a parameter its slopes say nothing either: the curvature tells.
+    least = np.zeros(len(active))
+    least[active] = np.diag(inverse)
+    return covariance, Z_95 * np.sqrt(np.maximum(np.diag(covariance), least))
 
 
 class HeldOut(NamedTuple):

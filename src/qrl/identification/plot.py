@@ -19,7 +19,7 @@ def draw(path: Path, title: str, rows: list[Row], found: HeldOut) -> None:
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.1, 1.0, 1.2))
-    _parameters(left, [row for row in rows if row.start])
+    _parameters(left, [row for row in rows if row.start > 0.0 and row.name != "thrust_curve"])
     for distance, color, name in ((found.start_m, START, "starting vehicle"), (found.fitted_m, FITTED, "fitted")):
         low, median, high = 1e3 * np.quantile(distance, (0.05, 0.5, 0.95), axis=0)
         middle.fill_between(found.lead_s, low, high, color=color, alpha=0.2, linewidth=0)
