@@ -123,7 +123,7 @@ def test_intervals_cover(flown: tuple[np.ndarray, np.ndarray], tmp_path: Path) -
 def test_what_a_still_hover_leaves_open_is_kept_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Commands that do not change: lag, thrust curve and drag stay; the thrust that hovers is found."""
     states, commands = flown_logs.fly(Truth(START, **CHANGES), SECONDS, 2, seed=3, shake=0.0)
-    states, commands = measured(states[:, 200:], 3), commands[:, 200:]
+    states, commands = measured(states[:, 60:], 3), commands[:, 60:]
     paths = [flown_logs.write(tmp_path / f"{i}.csv", states[i], commands[i]) for i in range(2)]
     assert qrl("identify", *paths, "--vehicle", "crazyflie", "--out", tmp_path / "mine.json") == 0
     mine = json.loads((tmp_path / "mine.json").read_text())
