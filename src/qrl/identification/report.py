@@ -91,7 +91,7 @@ def fitted_data(model: Model, fit: Fit, start: dict[str, Any], source: str) -> d
         for i, motor in enumerate(data["motors"]):
             motor["max_N"] = value(f"motors[{i + 1}].max_N")
     lags = [value("rotor_rise_s"), value("rotor_fall_s")]
-    names = {
+    names: dict[str, Any] = {
         "thrust_curve": value("thrust_curve"),
         "yaw_moment_m": value("yaw_moment_m"),
         "drag_height_m": value("drag_height_m"),
