@@ -186,7 +186,7 @@ def _on_grid(path: Path, raw: dict[str, np.ndarray], period_s: float) -> FlightL
     commands = raw["f"] if "f" in raw else raw["u"]
     total = np.concatenate([np.zeros_like(commands[:1]), np.cumsum(commands[:-1] * np.diff(time_s)[:, None], axis=0)])
     edges = np.append(grid, grid[-1] + period_s)
-    command = np.diff(np.stack([np.interp(edges, time_s, c) for c in total.T], axis=-1), axis=0) / period_s
+    command: np.ndarray = np.diff(np.stack([np.interp(edges, time_s, c) for c in total.T], axis=-1), axis=0) / period_s
     gaps = np.flatnonzero(np.diff(time_s) > GAP_PERIODS * max(period_s, float(np.median(np.diff(time_s)))))
     sound = np.ones(len(grid), bool)
     for i in gaps:
@@ -200,7 +200,9 @@ def _on_grid(path: Path, raw: dict[str, np.ndarray], period_s: float) -> FlightL
 def _slope(values: np.ndarray, period_s: float) -> np.ndarray:
     """The time derivative of [T, k] by a sliding cubic."""
     window = max(5, 2 * round(SMOOTHING_S / period_s / 2) + 1)
-    return savgol_filter(values, min(window, len(values) - 1 + len(values) % 2), 3, deriv=1, delta=period_s, axis=0)
+    return np.asarray(
+        savgol_filter(values, min(window, len(values) - 1 + len(values) % 2), 3, deriv=1, delta=period_s, axis=0)
+    )
 
 
 def body_rate(attitude: np.ndarray, slope: np.ndarray) -> np.ndarray:

@@ -235,4 +235,6 @@ def static_thrust_N(vehicle: Vehicle, command: np.ndarray, thrust: bool) -> np.n
     if thrust:
         return command.sum(axis=1)
     max_N = np.array([motor.max_N for motor in vehicle.motors])
-    return (max_N * np.asarray(rotors.thrust_fraction(np.float64(vehicle.thrust_curve), command))).sum(axis=1)
+    return (max_N * np.asarray(rotors.thrust_fraction(jnp.float32(vehicle.thrust_curve), jnp.asarray(command)))).sum(
+        axis=1
+    )
