@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train evaluate export view sweep seeds tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
+.PHONY: help setup train identify evaluate export view sweep seeds tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -21,6 +21,8 @@ define HELP
        RESUME=1                        resume that run from its last checkpoint
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--gamma 0.97"             any other flag of `qrl train`; `qrl train --help` lists them
+  make identify LOG=flight.csv VEHICLE=start.json   fit a vehicle's file to logs of its flights (LOG="a.csv b.csv")
+       OUT=fitted.json                 the fitted vehicle's file; ARGS="--hold-out c.csv": any flag of `qrl identify`
   make evaluate RUN=runs/circle      fly 1,000 fresh starts: table, evaluation.json, plots
        ARGS=--off-nominal              any flag of `qrl evaluate`; "--beside runs/ppo": other runs too
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, verified bit for bit
@@ -66,6 +68,8 @@ need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
 # A run's config.json names its own task.
 $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
 $(call need,seeds,$(TASK),TASK is missing: make seeds TASK=circle ("make tasks" lists them))
+$(call need,identify,$(LOG),LOG is missing: make identify LOG=flight.csv VEHICLE=start.json)
+$(call need,identify,$(VEHICLE),VEHICLE is missing: make identify LOG=flight.csv VEHICLE=start.json)
 $(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/grids/pendulum_lr.json)
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
 $(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
@@ -76,6 +80,10 @@ train: $(STAMP)
 		$(call flag,--vehicle,$(VEHICLE)) $(call flag,--uncertainty,$(UNCERTAINTY)) \
 		$(call flag,--reference,$(REFERENCE)) $(call flag,--out,$(OUT)) $(if $(filter-out 0,$(RESUME)),--resume) \
 		$(call flag,--config,$(CONFIG)) $(ARGS)
+
+# LOG is a list: its words are not quoted.
+identify: $(STAMP)
+	@exec $(QRL) identify $(LOG) $(call flag,--vehicle,$(VEHICLE)) $(call flag,--out,$(OUT)) $(ARGS)
 
 evaluate: $(STAMP)
 	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) $(ARGS)

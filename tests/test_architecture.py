@@ -46,6 +46,7 @@ ROOMS: dict[str, dict[str, Room]] = {
             {"tasks", "training", "runs", "algorithm", "config"}, MATHS | WORLDS | {"pydantic", "matplotlib"}
         ),
         "evaluation": Room({"tasks", "training", "export", "runs", "algorithm", "config"}, MATHS | WORLDS),
+        "identification": Room(set(), MATHS | WORLDS | {"scipy", "matplotlib"}),
         "cli": Room({"*"}, MATHS | WORLDS | {"rich"}),
     },
     "qrl_envs": {
@@ -284,6 +285,7 @@ BROKEN = {
     "request": ("qrl/request.py", "from qrl.sweep import grid", doors, "no door from request to sweep"),
     "sweep": ("qrl/sweep/grid.py", "from qrl.export import emit", doors, "no door from sweep to export"),
     "evaluation": ("qrl/evaluation/trained_run.py", "from qrl.cli import terminal", doors, "no door"),
+    "identification": ("qrl/identification/fit.py", "from qrl.runs import files", doors, "no door from identification"),
     "cli, a library": ("qrl/cli/main.py", "import optax", doors, "libraries of cli"),
     "package, at import": ("qrl/__init__.py", "from qrl.algorithm import learner", doors, "no door from __init__"),
     "__main__": ("qrl/__main__.py", "from qrl.training import loop", doors, "no door from __main__"),

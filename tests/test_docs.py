@@ -35,7 +35,7 @@ def commands() -> list[str]:
             found += [
                 line
                 for line in block.splitlines()
-                if re.match(r"make\b|.*\bqrl (train|evaluate|export|view|sweep)", line)
+                if re.match(r"make\b|.*\bqrl (train|evaluate|export|view|sweep|identify)", line)
             ]
     return sorted(set(found))
 
@@ -83,15 +83,18 @@ def test_commands_exist(line: str) -> None:
             "FAST",
             "NAME",
             "UNCERTAINTY",
+            "LOG",
             "PYTHON",
         }
         assert set(variables) <= known
         command = targets[0] if targets else ""
         subject = variables.get({"train": "TASK", "sweep": "GRID"}.get(command, "RUN"), "x")
         words = [command, subject, *shlex.split(variables.get("ARGS", ""))]
+        if command == "identify":
+            words = [command, *variables["LOG"].split(), "--vehicle", variables["VEHICLE"], *words[2:]]
     else:
         words = words[next(i for i, word in enumerate(words) if word.endswith("qrl")) + 1 :]
-    if words[0] in ("train", "evaluate", "export", "view", "sweep"):
+    if words[0] in ("train", "evaluate", "export", "view", "sweep", "identify"):
         parser.parse_args(words)
 
 

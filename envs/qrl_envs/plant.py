@@ -53,6 +53,7 @@ class Ranges(NamedTuple):
     bias_wander_s: chex.Array
     thrust_curve: chex.Array  # []
     drag_N_s_m: chex.Array  # [3]
+    drag_height_m: chex.Array  # []
 
 
 class World(NamedTuple):
@@ -83,7 +84,7 @@ def ranges(uncertainty: Uncertainty, vehicle: Vehicle) -> Ranges:
 
     data: dict[str, Any] = {name: getattr(uncertainty, name) for name in Uncertainty.model_fields}
     data |= {"rotor_rise_s": lag(vehicle.rotor_rise_s), "rotor_fall_s": lag(vehicle.rotor_fall_s)}
-    data |= {"thrust_curve": vehicle.thrust_curve, "drag_N_s_m": vehicle.drag_N_s_m}
+    data |= {name: getattr(vehicle, name) for name in ("thrust_curve", "drag_N_s_m", "drag_height_m")}
     return Ranges(**{name: jnp.asarray(data[name], jnp.float32) for name in Ranges._fields})
 
 
@@ -148,6 +149,7 @@ def draw(
             wind_m_s=within(ranges.wind_m_s, u[7]) * jnp.stack([jnp.cos(wind), jnp.sin(wind), jnp.zeros_like(wind)]),
             force_N=force * own_weight_N * _direction(u[8:10]),
             torque_N_m=within(ranges.torque_share, u[10]) * roll * _direction(u[11:13]),
+            drag_height_m=ranges.drag_height_m,
         ),
         latency_s=within(ranges.latency_s, u[13]),
         sensors=Sensors(
@@ -248,7 +250,7 @@ def step(
     """One control period under `action` [N], after which the position's error is relative to `origin_m` [3]. With
     `rotor_speed` −1 to 1 stands for a speed from 0 to the greatest.
     """
-    world, physics = flight.world, flight.world.physics
+    world = flight.world
     set_point, applied = commanded(world, action, rotor_speed)
     set_points = jnp.concatenate([set_point[None], flight.set_points[:-1]])
     # Set-point i acts from latency_s − i·dt_s on; before that, set-point i + 1.
@@ -258,32 +260,13 @@ def step(
     new = jnp.sum(jnp.where(ages == first, set_points, 0.0), axis=0)
     old = jnp.sum(jnp.where(ages == jnp.minimum(first + 1, set_points.shape[0] - 1), set_points, 0.0), axis=0)
 
-    def speed_at(time_s: chex.Array) -> chex.Array:
-        before = rotors.after(world.rotors, flight.speed, old, jnp.minimum(time_s, late_s))
-        return rotors.after(world.rotors, before, new, jnp.maximum(time_s - late_s, 0.0))
-
-    def thrust_at(time_s: float) -> chex.Array:
-        speed = speed_at(jnp.float32(time_s)) if time_s else flight.speed
-        return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, speed)
-
-    acting = disturbance(flight)
-    substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
-    body, short_s = flight.body, dt_s / substeps
-    for i in range(substeps):
-        begin_s, middle_s = i * short_s, (i + 0.5) * short_s
-        body = integrate.midpoint(
-            lambda b, t=begin_s: quadrotor.derivative(physics, b, thrust_at(t), acting),
-            lambda b, t=middle_s: quadrotor.derivative(physics, b, thrust_at(t), acting),
-            body,
-            short_s,
-        )
-        body = _renormalized(body)
+    body, speed = advance(world, disturbance(flight), flight.body, flight.speed, (old, new), late_s, dt_s)
     steps = flight.steps + 1
     history = sensors.follow(world.sensors, flight.history, body, steps, dt_s)
     sensed = sensors.sense(world.sensors, history, body, steps, dt_s)
     return Flight(
         body=body,
-        speed=speed_at(jnp.float32(dt_s)),
+        speed=speed,
         set_points=set_points,
         world=world,
         sensed=sensed,
@@ -293,6 +276,42 @@ def step(
         history=history,
         gust=gusts.after(world.gust, world.sensors, flight.gust, steps, dt_s),
     )
+
+
+def advance(
+    world: World,
+    acting: Disturbance,
+    body: Body,
+    speed: chex.Array,
+    set_points: tuple[chex.Array, chex.Array],
+    late_s: chex.Array,
+    dt_s: float,
+) -> tuple[Body, chex.Array]:
+    """Body and rotor speeds [N] after a period in which a disturbance acts, and the first of two set-points [N] for
+    `late_s` [], then the second.
+    """
+    physics, (old, new) = world.physics, set_points
+
+    def speed_at(time_s: chex.Array) -> chex.Array:
+        before = rotors.after(world.rotors, speed, old, jnp.minimum(time_s, late_s))
+        return rotors.after(world.rotors, before, new, jnp.maximum(time_s - late_s, 0.0))
+
+    def thrust_at(time_s: float) -> chex.Array:
+        now = speed_at(jnp.float32(time_s)) if time_s else speed
+        return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, now)
+
+    substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
+    short_s = dt_s / substeps
+    for i in range(substeps):
+        begin_s, middle_s = i * short_s, (i + 0.5) * short_s
+        body = integrate.midpoint(
+            lambda b, t=begin_s: quadrotor.derivative(physics, b, thrust_at(t), acting),
+            lambda b, t=middle_s: quadrotor.derivative(physics, b, thrust_at(t), acting),
+            body,
+            short_s,
+        )
+        body = _renormalized(body)
+    return body, speed_at(jnp.float32(dt_s))
 
 
 def commanded(world: World, action: chex.Array, rotor_speed: bool) -> tuple[chex.Array, chex.Array]:

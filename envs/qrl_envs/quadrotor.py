@@ -95,6 +95,7 @@ class Disturbance(NamedTuple):
     wind_m_s: chex.Array  # [3] world
     force_N: chex.Array  # [3] world
     torque_N_m: chex.Array  # [3] body
+    drag_height_m: chex.Array  # [] of where drag acts above the center of mass, along body z
 
 
 def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Disturbance | None = None) -> Body:
@@ -110,9 +111,11 @@ def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Di
         air_speed = _product(
             jnp.swapaxes(rotation_matrix, 0, 1), body.twist.velocity_m_s - disturbance.wind_m_s
         )  # body
-        drag = _product(rotation_matrix, disturbance.drag_N_s_m * air_speed)
+        body_drag = disturbance.drag_N_s_m * air_speed
+        drag = _product(rotation_matrix, body_drag)
         acceleration = acceleration + (disturbance.force_N - drag) / physics.mass_kg
-        torque = torque + disturbance.torque_N_m
+        x, y, z = jnp.unstack(disturbance.drag_height_m * body_drag)  # torque about the center of mass: height × −drag
+        torque = torque + disturbance.torque_N_m + jnp.stack([y, -x, jnp.zeros_like(z)])
     gravity = jnp.stack([jnp.zeros_like(physics.gravity_m_s2)] * 2 + [physics.gravity_m_s2])
     inertia = physics.inertia_kg_m2
     if inertia.ndim == omega.ndim:

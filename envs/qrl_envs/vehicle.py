@@ -65,6 +65,7 @@ class Vehicle(Spec):
         0.0
     )  # c of thrust/max_N = c·w + (1 − c)·w², w the speed
     drag_N_s_m: tuple[NonNegative, NonNegative, NonNegative] = later((0.0, 0.0, 0.0))  # linear, along body x, y, z
+    drag_height_m: Real = later(0.0)  # of where it acts above the center of mass, along body z
 
     @model_validator(mode="after")
     def _can_fly(self) -> "Vehicle":

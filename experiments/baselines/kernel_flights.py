@@ -87,7 +87,8 @@ class Reference(NamedTuple):
 
 def _point() -> Reference:
     steps = round(DURATION_S / PERIOD_S)
-    return Reference("hover", *np.zeros((3, steps + 1, 3)), steps, round(TAIL_S / PERIOD_S))
+    still = np.zeros((steps + 1, 3))
+    return Reference("hover", still, still, still, steps, round(TAIL_S / PERIOD_S))
 
 
 HOVER = _point()
@@ -436,9 +437,9 @@ def read_references(path: Path) -> list[Reference]:
     with np.load(path) as stored:
         found = []
         for name in dict.fromkeys(key.split("/")[0] for key in stored.files):
-            arrays = (stored[f"{name}/{field}"] for field in Reference._fields[1:4])
-            counts = (int(stored[f"{name}/{field}"]) for field in Reference._fields[4:])
-            found.append(Reference(name, *arrays, *counts))
+            position, velocity, acceleration = (stored[f"{name}/{field}"] for field in Reference._fields[1:4])
+            steps, tail = (int(stored[f"{name}/{field}"]) for field in Reference._fields[4:])
+            found.append(Reference(name, position, velocity, acceleration, steps, tail))
         return found
 
 

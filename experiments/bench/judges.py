@@ -124,7 +124,8 @@ def references() -> list[Reference]:
         duration_s, tail_s = evaluation_s(spec)
         steps = round(duration_s / PERIOD_S)
         sampled = spec.at(np.arange(steps + 100) * PERIOD_S)
-        found.append(Reference(name, *sampled, steps, round(tail_s / PERIOD_S)))
+        position, velocity, acceleration = sampled
+        found.append(Reference(name, position, velocity, acceleration, steps, round(tail_s / PERIOD_S)))
     return found
 
 
@@ -220,7 +221,9 @@ def ours(vehicle: Vehicle, given: Given, drag: bool) -> State:
         physics=physics,
         motor_factor=jnp.ones(len(vehicle.motors)),
         rotors=rotors.rotors(vehicle),
-        disturbance=Disturbance(jnp.asarray(vehicle.drag_N_s_m) * drag, none, none, none),
+        disturbance=Disturbance(
+            jnp.asarray(vehicle.drag_N_s_m) * drag, none, none, none, jnp.float32(vehicle.drag_height_m)
+        ),
         latency_s=zero,
         sensors=plant.Sensors(plant.Noise(zero, zero, zero, zero), none, zero, zero),
     )

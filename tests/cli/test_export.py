@@ -157,22 +157,31 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
     np.testing.assert_array_equal(memory, action)
 
 
-def test_a_circle_of_a_real_vehicle_exports(tmp_path: Path) -> None:
-    """In the body frame, with all memory: the policy is the one that was trained, and the kernel is verified."""
+@pytest.mark.parametrize(
+    ("task", "vehicle", "inputs"), [("circle", ["--vehicle", "crazyflie"], 12 + 4 + 5), ("any", [], 15 + 9 + 4 + 3)]
+)
+def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], inputs: int, tmp_path: Path) -> None:
+    """With all memory, a preview, and actions that are rotor speeds: the policy is the one that was trained, and the
+    kernel is verified.
+    """
     run = tmp_path / "run"
-    assert qrl("train", "circle", "--vehicle", "crazyflie", "--out", run, *TINY.split()) == 0
+    assert qrl("train", task, *vehicle, "--out", run, *TINY.split()) == 0
     loaded = TrainedRun.load(run)
     policy = loaded.float_policy()
-    assert policy.rotates_integral
+    assert policy.body_frame
+    assert policy.body_frame.last
     env: Any = loaded.env
     seen = np.array(jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
-    seen[:, 18:26] = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 8))
+    remembered = slice(policy.body_frame.measured, env.policy_observation_size)
+    seen[:, remembered] = np.random.default_rng(0).uniform(-0.5, 0.5, seen[:, remembered].shape)
     wanted = policy.to_si(np.asarray(loaded.policy_mean(seen)))
     assert np.ptp(wanted, axis=0).min() > 1e-4
     np.testing.assert_allclose(policy(inputs_in_si(policy, seen)), wanted, atol=1e-6)
     assert qrl("export", run, *LEAST) == 0
     manifest = json.loads((run / "export" / "manifest.json").read_text())
-    assert manifest["network"][0] == 12 + 4 + 5
+    assert manifest["network"][0] == inputs
+    said = {(port["unit"], port.get("quantity")) for port in manifest["act"]}
+    assert said == ({("1", "rotor speed fraction")} if task == "any" else {("N", None)})
     assert manifest["memory"]["integral"]["circle_m"] == 1.0
 
 

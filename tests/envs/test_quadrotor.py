@@ -129,7 +129,12 @@ def momentum_and_energy(vehicle: Physics, body: Body) -> Array:
 
 
 def newton_euler(
-    vehicle: Vehicle, thrust: Array, drag: Array = NOTHING, push: Array = NO_PUSH, wind: Array = NOTHING
+    vehicle: Vehicle,
+    thrust: Array,
+    drag: Array = NOTHING,
+    push: Array = NO_PUSH,
+    wind: Array = NOTHING,
+    height_m: float = 0.0,
 ) -> Callable[[float, Array], Array]:
     """The equations of motion, written apart: r × F for each motor, and the attitude as a rotation matrix.
 
@@ -150,7 +155,8 @@ def newton_euler(
         skew = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
         air = to_world.T @ (velocity - wind)
         acceleration = (to_world @ (force - drag * air) + push[:3]) / vehicle.mass_kg - gravity * UP
-        w_dot = np.linalg.solve(inertia, moment - np.cross(w, inertia @ w))
+        from_drag = np.cross([0.0, 0.0, height_m], -drag * air)
+        w_dot = np.linalg.solve(inertia, moment + from_drag - np.cross(w, inertia @ w))
         return np.concatenate([velocity, acceleration, w_dot, (to_world @ skew).ravel()])
 
     return rate_of_change
@@ -201,14 +207,14 @@ def test_torque_free_motion_keeps_momentum_and_energy(fly: Integrator, order: in
 
 @pytest.mark.parametrize("spec", [CROOKED, TILTED], ids=["crooked", "tilted"])
 def test_derivative_is_newton_euler(spec: Vehicle) -> None:
-    """In 50 random states under random thrusts, drag, wind, force and torque: all 18 rates of change."""
+    """In 50 random states under random thrusts, drag above the center of mass, wind, push: all 18 rates."""
     rng = np.random.default_rng(2)
     vehicle, body = physics(spec), bodies(rng, 50)
     thrust = rng.uniform(0.0, 5.0, size=(50, len(spec.motors)))
     drag, wind, push = np.array([0.1, 0.2, 0.3]), np.array([1.0, -2.0, 0.5]), 0.1 * np.arange(1.0, 7.0)
-    ours = derivatives(vehicle, body, thrust, Disturbance(drag, wind, push[:3], push[3:]))
+    ours = derivatives(vehicle, body, thrust, Disturbance(drag, wind, push[:3], push[3:], np.float64(0.02)))
     for i in range(50):
-        expected = newton_euler(spec, thrust[i], drag, push, wind)(0.0, flat(one(body, i)))
+        expected = newton_euler(spec, thrust[i], drag, push, wind, 0.02)(0.0, flat(one(body, i)))
         np.testing.assert_allclose(ours.pose.position_m[i], expected[:3], atol=1e-12)
         np.testing.assert_allclose(ours.twist.velocity_m_s[i], expected[3:6], rtol=1e-6, atol=1e-5)
         np.testing.assert_allclose(

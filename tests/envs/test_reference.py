@@ -60,7 +60,8 @@ def test_circle_and_eight_are_the_textbooks() -> None:
     angle = -2.0 / 1.5 * 0.6
     wanted = [[1.5, 1.0, 0.5], [1.5 * np.cos(angle), 1.0 + 1.5 * np.sin(angle), 0.5]]
     np.testing.assert_allclose(found, wanted, atol=1e-12)
-    eight = task.from_data({"extend": "track"}, "here").evaluation.reference  # pyright: ignore[reportAttributeAccessIssue]
+    eight = track().evaluation.reference
+    assert eight
     np.testing.assert_allclose(eight.at(np.array([5.5 / 8])).position_m, [[np.sqrt(0.5), 0.5, 0.0]], atol=1e-12)
 
 
@@ -254,7 +255,7 @@ def test_a_csv_is_a_reference(tmp_path: Path) -> None:
     path = tmp_path / "mine.csv"
     rows = [f"{t},{0.3 * t},{0.1 * t * t},1.0" for t in np.arange(0, 3, 0.1)]
     path.write_text("\n".join(["time_s,x_m,y_m,z_m", *rows]))
-    found = task.load("track", reference=str(path)).evaluation.reference  # pyright: ignore[reportAttributeAccessIssue]
+    found: Any = task.load("track", reference=str(path)).evaluation.reference  # pyright: ignore[reportAttributeAccessIssue]
     np.testing.assert_allclose(found.at(np.array([1.25])).position_m, [[0.375, 0.15625, 1.0]], atol=1e-3)
     path.write_text("\n".join(["time_s,x_m,y_m,z_m", *rows[:5], "0.5,a,0,0"]))
     with pytest.raises(BadInput, match=r"row 7: x_m: expected a number, found 'a'"):

@@ -117,6 +117,16 @@ def build_parser() -> _Parser:
     view.add_argument("--starts", type=whole_number, nargs="+", metavar="N", help=chosen)
     view.add_argument("--out", type=Path, metavar="FILE", help="HTML file (default RUN/view.html)")
 
+    identify = commands.add_parser("identify", help="fit a vehicle's file to logs of its flights")
+    identify.add_argument("logs", type=Path, nargs="+", metavar="LOG", help="CSV file of a flight")
+    start = "the vehicle to start from: a shipped name or a .json file"
+    identify.add_argument("--vehicle", required=True, metavar="VEHICLE", help=start)
+    fitted = "the fitted vehicle's file (default fitted.json)"
+    identify.add_argument("--out", type=Path, default=Path("fitted.json"), metavar="FILE", help=fitted)
+    apart = "share of the flights not fitted, or logs of such flights (default 0.25)"
+    identify.add_argument("--hold-out", nargs="+", default=["0.25"], metavar="SHARE|LOG", help=apart)
+    identify.add_argument("--plot", type=Path, metavar="FILE", help="PNG file (default beside the fitted vehicle's)")
+
     sweep = commands.add_parser("sweep", help="train every point of a grid; rerun to resume")
     sweep.add_argument("grid", type=Path, metavar="GRID", help="grid file, such as experiments/grids/pendulum_lr.json")
     sweep.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the results (default runs/GRID)")
@@ -209,7 +219,7 @@ def limit_size(folder: Path, most_bytes: int) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 failed while running, 2 the input was wrong."""
     args = _parse(argv)
-    subject = {"train": "task", "sweep": "grid"}.get(args.command, "run")
+    subject = {"train": "task", "sweep": "grid", "identify": "vehicle"}.get(args.command, "run")
     if args.command != "tasks":
         print(f"qrl {args.command} {getattr(args, subject) or args.config or ''}: loading JAX", flush=True)
     _note_former_names(getattr(args, "config", None) or getattr(args, "grid", None))

@@ -1,0 +1,1 @@
+"""From flight logs to a vehicle: logs, a model with free parameters, its fit with intervals, held-out errors."""
