@@ -86,14 +86,16 @@ identify: $(STAMP)
 	@exec $(QRL) identify $(LOG) $(call flag,--vehicle,$(VEHICLE)) $(call flag,--out,$(OUT)) $(ARGS)
 
 evaluate: $(STAMP)
-	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) $(ARGS)
+	@exec $(QRL) evaluate $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) \
+		$(call flag,--vehicle,$(VEHICLE)) $(ARGS)
 
 # `export` is a directive of make itself where a line begins with it.
 $(or export): $(STAMP)
 	@exec $(QRL) export $(call quoted,$(RUN)) $(call flag,--name,$(NAME)) $(ARGS)
 
 view: $(STAMP)
-	@exec $(QRL) view $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) $(ARGS)
+	@exec $(QRL) view $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) \
+		$(call flag,--vehicle,$(VEHICLE)) $(ARGS)
 
 sweep: $(STAMP)
 	@exec $(QRL) sweep $(call quoted,$(GRID)) $(call flag,--out,$(OUT)) $(ARGS)

@@ -22,6 +22,7 @@ from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.reference import reference_data
 from qrl_envs.specfile import BadInput
+from qrl_envs.vehicle import vehicle_data
 
 PRESET_RECOVERY_S = 0.6  # and the time scale of their vehicle, the paper's (Vehicle.recovery_s)
 PRESET_PERIOD_S = {"quadrotor": 0.01, "pendulum": 0.05}  # control periods that the presets are made for
@@ -122,15 +123,46 @@ def spec(record: TaskRecord) -> task_spec.Task:
     return task_spec.from_data(record.spec, record.name)
 
 
-def following(record: TaskRecord, reference: str | None) -> TaskRecord:
-    """The task whose evaluation follows the reference of that name or file, in place of its own; None: its own."""
-    if reference is None:
+def following(record: TaskRecord, reference: str | None = None, vehicle: str | None = None) -> TaskRecord:
+    """The task flown with the reference and the vehicle of these names or files, in place of its own; None: its own.
+
+    Another vehicle is for a policy of any vehicle, whose motors it takes in the order that the policy knows.
+    """
+    if reference is None and vehicle is None:
         return record
-    if record.spec is None or "reference" not in record.spec:
-        raise BadInput(f"--reference: expected a task that tracks one, found '{record.name}'")
-    given = task_spec.with_reference(record.spec, reference_data(reference))
-    task = task_spec.from_data(given, f"{record.name} with reference {reference}")
+    given, words = dict(record.spec or {}), []
+    if reference is not None:
+        if "reference" not in given:
+            raise BadInput(f"--reference: expected a task that tracks one, found '{record.name}'")
+        given = task_spec.with_reference(given, reference_data(reference))
+        words.append(f"reference {reference}")
+    if vehicle is not None:
+        if "distribution" not in given:
+            raise BadInput(f"--vehicle: expected a policy of any vehicle, found one of '{record.name}'")
+        own = vehicle_data(vehicle)
+        places = _like(own.get("motors", []), given["vehicle"]["motors"], vehicle)
+        del given["distribution"]
+        given |= {"vehicle": {**own, "motors": places}, "uncertainty": {}}
+        words.append(f"vehicle {vehicle}")
+    task = task_spec.from_data(given, f"{record.name} with {' and '.join(words)}")
     return TaskRecord(name=record.name, spec=task.model_dump(mode="json", exclude_none=True))
+
+
+def _like(motors: list[Any], known: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
+    """`motors` in the order of those `known`: each in its quarter about body z, with its spin."""
+
+    def quarter(motor: dict[str, Any]) -> tuple[bool, bool, int]:
+        x, y = motor["position_m"][:2]
+        return x > 0, y > 0, motor["spin"]
+
+    try:
+        found = {quarter(motor): motor for motor in motors}
+        return [found[quarter(motor)] for motor in known]
+    except (KeyError, TypeError, ValueError):
+        places = ", ".join(f"x {p['position_m'][0]:+.2g}, y {p['position_m'][1]:+.2g}: {p['spin']:+d}" for p in known)
+        raise BadInput(
+            f"{where}: key 'motors': expected one in each quarter about body z, with the spins of {places}"
+        ) from None
 
 
 def check_task_record(record: TaskRecord, where: str) -> TaskRecord:

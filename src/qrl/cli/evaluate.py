@@ -44,10 +44,8 @@ class Comparison(NamedTuple):
 
 def evaluate(args: argparse.Namespace) -> int:
     """Fly every seed of a run from fresh starts; print a table, write evaluation.json and plots to each folder."""
-    config = _following(tasks.load_run_config(args.run), args.reference)
-    others = [
-        (folder, _of_same_task(folder, args.run, config, args.reference)) for folder in dict.fromkeys(args.beside)
-    ]
+    config = _following(args.run, args)
+    others = [(folder, _of_same_task(folder, args.run, config, args)) for folder in dict.fromkeys(args.beside)]
     task = tasks.spec(config.task) if config.task.spec else None
     named = _conditions(args.run, config, task) if args.off_nominal else {}
     envs = {NOMINAL: tasks.environment(config.task)}
@@ -97,13 +95,14 @@ def _conditions(folder: Path, config: RunConfig, task: Task | None) -> dict[str,
     return conditions(task)
 
 
-def _following(config: RunConfig, reference: str | None) -> RunConfig:
-    return config.model_copy(update={"task": tasks.following(config.task, reference)})
+def _following(folder: Path, args: argparse.Namespace) -> RunConfig:
+    config = tasks.load_run_config(folder)
+    return config.model_copy(update={"task": tasks.following(config.task, args.reference, args.vehicle)})
 
 
-def _of_same_task(folder: Path, run: Path, config: RunConfig, reference: str | None) -> RunConfig:
+def _of_same_task(folder: Path, run: Path, config: RunConfig, args: argparse.Namespace) -> RunConfig:
     """The run in `folder`; BadInput unless it has the task of `run`. Training settings may differ."""
-    other = _following(tasks.load_run_config(folder), reference)
+    other = _following(folder, args)
     if other.task.name != config.task.name or _evaluation_spec(other) != _evaluation_spec(config):
         raise BadInput(
             f"{folder}: --beside: expected a run of the same task as {run}, '{config.task.name}', found one of"

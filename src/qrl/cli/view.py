@@ -25,7 +25,7 @@ LANES = 8  # the number of starts is a multiple, so that few numbers of starts a
 def view(args: argparse.Namespace) -> int:
     """Fly a few starts of `qrl evaluate` with every seed of a run; write view.html to each folder."""
     config = tasks.load_run_config(args.run)
-    config = config.model_copy(update={"task": tasks.following(config.task, args.reference)})
+    config = config.model_copy(update={"task": tasks.following(config.task, args.reference, args.vehicle)})
     if not config.task.spec:
         raise BadInput(
             f"{args.run}: expected a run of one of our own tasks, found another environment, '{config.task.name}'"
