@@ -37,11 +37,6 @@ class Condition(NamedTuple):
     uncertainty: Uncertainty = Uncertainty()
     paper_trial: bool = False  # start with the position and velocity of the paper's trial
     held_periods: int = 1  # periods of the task for which each action of the policy is applied
-    periods: int = 1  # of the policy in one of the task
-
-    def environment(self, task: QuadrotorTask) -> "OffNominal":
-        """The task under this condition."""
-        return (OffNominal if self.periods == 1 else Faster)(task, self)
 
 
 def _fixed(**values: float) -> Uncertainty:
@@ -79,7 +74,6 @@ def conditions(task: QuadrotorTask) -> dict[str, Condition]:
         "bias": Condition("the position measured 2 cm off, in any direction", _fixed(position_bias_m=BIAS_M)),
         "estimator": Condition(fixes, _fixed(**FIXES)),
         "half_rate": Condition("the policy at half of its rate", held_periods=2),
-        "double_rate": Condition("the policy at double its rate", periods=2),
         "noise": Condition("sensors err by 1 cm, 2 cm/s, 0.01 rad, 0.02 rad/s (1 σ, each axis)", _fixed(**NOISE)),
         "together": Condition(
             f"latency of 10 ms, noise, mass 20 % above, {blows}",
@@ -126,18 +120,3 @@ class OffNominal(RealQuadrotorEnv):
             for pair in zip(trial, (body.pose.position_m, body.twist.velocity_m_s), strict=True)
         )
         return plant.Body(body.pose._replace(position_m=position), body.twist._replace(velocity_m_s=velocity))
-
-
-class Faster(OffNominal):
-    """A policy at a higher rate than its task's: its previous action is as many periods nearer. The integral counts
-    seconds, and the return as many rewards as at the task's rate.
-    """
-
-    def __init__(self, task: QuadrotorTask, condition: Condition) -> None:
-        self._periods = condition.periods
-        short = task.model_copy(update={"control_period_s": task.control_period_s / condition.periods})
-        super().__init__(short, condition)
-
-    def _advance(self, params: Any, x: plant.Flight, action: chex.Array) -> tuple[plant.Flight, chex.Array]:
-        flight, reward = super()._advance(params, x, action)
-        return flight, reward / self._periods

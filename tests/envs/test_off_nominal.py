@@ -58,9 +58,7 @@ def test_conditions_start_as_the_task_does() -> None:
 def test_one_program_serves_all_conditions() -> None:
     """Their parameters have one structure, and each changes what it says."""
     for spec in (HOVER, REAL):
-        envs = {name: c.environment(spec) for name, c in off_nominal.conditions(spec).items()}
-        assert {name for name, env in envs.items() if type(env) is not OffNominal} == {"double_rate"}  # its own program
-        named = {name: env.params for name, env in envs.items() if type(env) is OffNominal}
+        named = {name: OffNominal(spec, c).params for name, c in off_nominal.conditions(spec).items()}
         shapes = {str(jax.tree.map(jnp.shape, params)) for params in named.values()}
         assert len(shapes) == 1
         if spec is REAL:
@@ -95,18 +93,16 @@ def test_the_conditions_are_those_that_a_policy_is_judged_by() -> None:
             if name in several:
                 assert changed == several[name]
             else:
-                assert len(changed) == (name not in ("exact", "trial", "half_rate", "double_rate")), name
+                assert len(changed) == (name not in ("exact", "trial", "half_rate")), name
     names = [set(off_nominal.conditions(spec)) for spec in (HOVER, REAL, quadrotor_task("circle"))]
     assert names[1] - names[0] == {"lag_x2", "wind"}
     assert names[0] - names[2] == {"trial"}
 
 
-def test_the_policys_rate_is_halved_and_doubled() -> None:
-    """Half: each action acts for two periods, whatever the policy says in the second. Double: twice as many shorter
-    periods, of which two have the reward of one.
-    """
+def test_at_half_the_rate_each_action_acts_for_two_periods() -> None:
+    """Whatever the policy says in the second."""
     named = off_nominal.conditions(REAL)
-    half, plain = (named[name].environment(REAL) for name in ("half_rate", "exact"))
+    half, plain = (OffNominal(REAL, named[name]) for name in ("half_rate", "exact"))
     actions = jnp.asarray(np.random.default_rng(0).uniform(-0.3, 0.3, (6, 4)), jnp.float32)
 
     @jax.jit
@@ -118,9 +114,3 @@ def test_the_policys_rate_is_halved_and_doubled() -> None:
     held = after(half.params, actions)
     np.testing.assert_allclose(held, after(plain.params, jnp.repeat(actions[::2], 2, axis=0)), atol=1e-6)
     assert jnp.abs(held - after(plain.params, actions)).max() > 0.1
-    double = named["double_rate"].environment(REAL)
-    assert double.control_period_s == REAL.control_period_s / 2
-    plan, own = double.evaluation(), plain.evaluation()
-    assert (plan.steps, plan.return_steps) == (2 * own.steps, 2 * own.return_steps)
-    start = jax.eval_shape(double.reset, jax.random.PRNGKey(0))
-    assert start.obs.shape == jax.eval_shape(plain.reset, jax.random.PRNGKey(0)).obs.shape

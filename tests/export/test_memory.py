@@ -25,6 +25,10 @@ from qrl.export.vectors import Observations, Vectors
 from qrl.export.verify import CORE_STEPS, HOST_STEPS, compare, verify
 
 WHICH = pytest.mark.parametrize("which", REMEMBERING)
+TANH = ("both", "track", "odd")  # the activation and what is remembered are apart in the source
+EITHER_ACTIVATION = pytest.mark.parametrize(
+    ("which", "activation"), [*((which, "relu") for which in REMEMBERING), *((which, "tanh") for which in TANH)]
+)
 MANY, FEW = 10_000, 600
 SANITIZED = (*STRICT, "-g", "-fsanitize=undefined,address", "-fno-sanitize-recover=all")
 
@@ -224,8 +228,7 @@ def test_the_integer_policy_is_the_literal_loop(which: str) -> None:
                     np.testing.assert_array_equal(act[0], kernel.act_safe)
 
 
-@WHICH
-@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@EITHER_ACTIVATION
 def test_integers_are_close_to_float(which: str, activation: str) -> None:
     """On inputs not calibrated on, of all memory."""
     policy, kernel = policies.remembering(which, activation), policies.remembering_kernel(which, activation)
@@ -383,8 +386,7 @@ def test_the_sequences_are_of_every_kind() -> None:
 
 
 @pytest.mark.usefixtures("host")
-@WHICH
-@pytest.mark.parametrize("activation", ["relu", "tanh"])
+@EITHER_ACTIVATION
 def test_the_host_gives_the_references_bits(which: str, activation: str, source_of: SourceOf, tmp_path: Path) -> None:
     each = [(SANITIZED, drawn(which, activation, MANY if activation == "relu" else FEW))]
     if (which, activation) == ("both", "relu"):
@@ -403,7 +405,7 @@ def test_every_core_gives_the_references_bits(core: Core, source_of: SourceOf, t
 
 @EITHER
 def test_each_memory_alone_gives_the_references_bits(core: Core | None, source_of: SourceOf, tmp_path: Path) -> None:
-    for which in ("action", "integral", "one action", "odd"):
+    for which in ("action", "integral", "one action", "odd", "track", "world circle"):
         wanted, source = drawn(which, "tanh", FEW), source_of(which, "tanh")
         if core is None:
             found = targets.run_host(source, tmp_path, STRICT, wanted.observations)
@@ -517,14 +519,28 @@ SOURCE_FAULTS = {
 }
 
 
+FRAME_FAULTS = {  # of a policy in the body frame, with heading, previews and the integral
+    "to the world": ("r[3 * i + j]", "r[3 * j + i]"),
+    "the wrong row": ("shifted(r[i], UP_SHIFT)", "shifted(r[i < 3 ? i : i - 3], UP_SHIFT)"),
+    "a preview left in the world": ("i < 3 * VECTORS", "i < 3 * VECTORS - 3"),
+    "a preview's step": ("x->one + 18 + i, 3, AHEAD_SHIFT", "x->one + 18 + i, 3, AHEAD_SHIFT - 1"),
+    "the integral left in the world": ("    rotated(x->one + i - LAST, r, last, LAST, 15);\n", "    (void)last;\n"),
+    "two axes of the integral": ("r, last, LAST, 15)", "r, last, LAST - 1, 15)"),
+}
+
+
 @pytest.mark.usefixtures("host")
-@pytest.mark.parametrize("fault", SOURCE_FAULTS.values(), ids=SOURCE_FAULTS.keys())
-def test_a_slip_in_the_source_shows(fault: tuple[str, str], tmp_path: Path) -> None:
-    source = policies.emitted(tmp_path, policies.remembering(), policies.remembering_kernel())
+@pytest.mark.parametrize(
+    ("which", "fault"),
+    [*(("both", each) for each in SOURCE_FAULTS.values()), *(("track", each) for each in FRAME_FAULTS.values())],
+    ids=[*SOURCE_FAULTS, *FRAME_FAULTS],
+)
+def test_a_slip_in_the_source_shows(which: str, fault: tuple[str, str], tmp_path: Path) -> None:
+    source = policies.emitted(tmp_path, policies.remembering(which), policies.remembering_kernel(which))
     text = source.read_text()
     assert fault[0] in text
     source.write_text(text.replace(*fault))
-    each = drawn("both", "relu", FEW), sequences("both", "relu", HOST_STEPS)
+    each = drawn(which, "relu", FEW), sequences(which, "relu", HOST_STEPS)
     found = [targets.run_host(source, tmp_path, ("-O0",), wanted.observations) for wanted in each]
     with pytest.raises(VerificationFailed, match="differs from the reference"):
         [compare("here", one, wanted.outputs) for one, wanted in zip(found, each, strict=True)]

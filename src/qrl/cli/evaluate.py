@@ -19,7 +19,7 @@ from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import checkpoint, files, record
 from qrl.runs.record import RunConfig
 from qrl_envs import measures
-from qrl_envs.off_nominal import Condition, conditions
+from qrl_envs.off_nominal import Condition, OffNominal, conditions
 from qrl_envs.plots import errors, off_nominal, settle
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task
@@ -49,7 +49,7 @@ def evaluate(args: argparse.Namespace) -> int:
     task = tasks.spec(config.task) if config.task.spec else None
     named = _conditions(args.run, config, task) if args.off_nominal else {}
     envs = {NOMINAL: tasks.environment(config.task)}
-    envs |= {name: condition.environment(task) for name, condition in named.items()}  # pyright: ignore[reportArgumentType]
+    envs |= {name: OffNominal(task, condition) for name, condition in named.items()}  # pyright: ignore[reportArgumentType]
     eval_envs = EvalEnvs(envs, evaluation_starts(args.starts))
     with ThreadPoolExecutor() as executor:
         seeds = _seed_runs(args.run, config, eval_envs, executor)

@@ -98,9 +98,10 @@ def build_parser() -> _Parser:
     for command in (evaluate, export, view):
         command.add_argument("run", type=Path, metavar="RUN", help="run folder")
     for command in (evaluate, view):
-        command.add_argument(
-            "--reference", metavar="REFERENCE", help=f"what to track: {figure} (default: the task's own)"
-        )
+        instead = f"{figure}, in place of the task's own"
+        command.add_argument("--reference", metavar="REFERENCE", help=instead)
+        other = "of a policy of any vehicle: a shipped vehicle's name or a .json file"
+        command.add_argument("--vehicle", metavar="VEHICLE", help=other)
     for command in (evaluate, export):
         command.add_argument("--starts", type=count, default=1000, metavar="N", help="number of starts (default 1000)")
     conditions = "also fly with other lag, latency, mass, thrust, wind, gusts, sensors and control rate"
