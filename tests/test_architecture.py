@@ -55,7 +55,9 @@ ROOMS: dict[str, dict[str, Room]] = {
         "integrate": Room(set(), MATHS),
         "vehicle": Room({"specfile"}, {"pydantic", "numpy"}),
         "uncertainty": Room({"specfile"}, {"pydantic"}),
-        "task": Room({"specfile", "vehicle", "uncertainty"}, {"pydantic"}),
+        "reference": Room({"specfile", "vehicle"}, {"pydantic", "numpy", "scipy"}),
+        "distribution": Room({"specfile", "vehicle", "uncertainty"}, {"pydantic"}),
+        "task": Room({"specfile", "vehicle", "uncertainty", "reference", "distribution"}, {"pydantic"}),
         "rotors": Room({"vehicle"}, MATHS),
         "pendulum": Room({"task", "integrate"}, MATHS),
         "quadrotor": Room({"task", "vehicle", "rotation", "integrate"}, MATHS),
@@ -64,15 +66,19 @@ ROOMS: dict[str, dict[str, Room]] = {
         "io_spec": Room({"task"}, MATHS),
         "symmetry": Room({"quadrotor"}, MATHS),
         "controllers": Room({"task", "vehicle", "quadrotor", "rotation"}, MATHS | {"scipy"}),
+        "target": Room({"quadrotor", "reference"}, MATHS),
+        "own_vehicle": Room({"distribution", "quadrotor", "rotors", "vehicle"}, MATHS),
         "noise": Room(set(), MATHS),
         "sensors": Room({"noise", "quadrotor", "rotation"}, MATHS),
         "gusts": Room({"noise", "quadrotor", "sensors"}, MATHS),
         "plant": Room(
-            {"task", "uncertainty", "vehicle", "quadrotor", "rotation", "rotors", "integrate", "sensors", "gusts"},
+            {"task", "uncertainty", "vehicle", "quadrotor", "rotation", "rotors", "integrate", "sensors", "gusts"}
+            | {"target", "own_vehicle"},
             MATHS,
         ),
         "env": Room(
-            {"task", "uncertainty", "pendulum", "quadrotor", "plant", "rewards", "measures", "symmetry"},
+            {"task", "uncertainty", "pendulum", "quadrotor", "plant", "rewards", "measures", "symmetry"}
+            | {"reference", "target", "own_vehicle"},
             MATHS | {"flax.struct"},
         ),
         "gymnasium_env": Room({"env", "task"}, MATHS | {"gymnasium"}),

@@ -84,6 +84,7 @@ def test_commands_exist(line: str) -> None:
             "NAME",
             "UNCERTAINTY",
             "LOG",
+            "REFERENCE",
             "PYTHON",
         }
         assert set(variables) <= known

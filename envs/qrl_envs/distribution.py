@@ -1,20 +1,15 @@
-"""Distributions of vehicles: each flight has a vehicle of its own, which the policy is not told."""
+"""Distributions of vehicles, as data of a task: each flight has a vehicle of its own, which the policy is not told.
+`own_vehicle` draws it.
+"""
 
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
-import chex
-import jax.numpy as jnp
-import numpy as np
-from pydantic import AfterValidator
+from pydantic import AfterValidator, model_validator
 
 from qrl_envs import specfile
-from qrl_envs.rotors import Rotors
 from qrl_envs.specfile import NonNegative, Positive, Spec
 from qrl_envs.uncertainty import Factor, Range, ascending
-from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle
-
-if TYPE_CHECKING:  # it imports tasks, which have distributions
-    from qrl_envs.quadrotor import Physics
+from qrl_envs.vehicle import LEAST_THRUST_PER_WEIGHT
 
 Curve = Annotated[tuple[float, float], AfterValidator(ascending)]
 
@@ -28,7 +23,7 @@ class VehicleDistribution(Spec):
     # Arm times the greatest thrust of a motor, over the moment of inertia about x; that about y differs by a factor.
     torque_per_inertia_1_s2: Factor = (50.0, 1200.0)
     pitch_factor: Factor = (0.85, 1.15)  # uniform
-    yaw_per_roll: Factor = (0.04, 0.45)  # angular acceleration of a motor about z over that about x, times √2
+    yaw_per_roll: Factor = (0.04, 0.45)  # angular acceleration by a motor about z, over √2 times that about x
     rotor_rise_s: Factor = (0.001, 0.15)
     fall_per_rise: Factor = (0.8, 2.0)  # uniform
     thrust_curve: Curve = (-0.15, 0.4)  # uniform
@@ -36,48 +31,17 @@ class VehicleDistribution(Spec):
     force_surplus: NonNegative = 0.3  # constant force at most, of the thrust beyond the weight up to half of that
     moment_z_factor: Positive = 1.7  # moment of inertia about z over that about x
 
-
-DRAWS = 9  # uniform numbers of a draw
-
-
-class Drawn(NamedTuple):
-    """A flight's own vehicle."""
-
-    physics: "Physics"
-    rotors: Rotors
-    drag_N_s_m: chex.Array  # [3]
-    surplus_weights: chex.Array  # []: what a constant force may be, of the weight
-
-
-def draw(spec: VehicleDistribution, base: "Physics", vehicle: Vehicle, u: chex.Array) -> Drawn:
-    """A vehicle of the mass and the motors' places of `base`, from u [DRAWS] uniform in [0, 1)."""
-
-    def within(pair: tuple[float, float], u: chex.Array) -> chex.Array:
-        return pair[0] + (pair[1] - pair[0]) * u
-
-    def log_within(pair: tuple[float, float], u: chex.Array) -> chex.Array:
-        return jnp.exp(within((float(np.log(pair[0])), float(np.log(pair[1]))), u))
-
-    arm_m = float(np.mean(np.linalg.norm(vehicle.motor_positions_m[:2], axis=0)))
-    spin = np.array([motor.spin for motor in vehicle.motors], np.float32)
-    ratio, agility = log_within(spec.thrust_per_weight, u[0]), log_within(spec.torque_per_inertia_1_s2, u[1])
-    thrust_N = ratio * base.mass_kg * STANDARD_GRAVITY_M_S2 / len(vehicle.motors)
-    moment = arm_m * thrust_N / agility
-    moments = jnp.stack([moment, moment / within(spec.pitch_factor, u[2]), spec.moment_z_factor * moment])
-    yaw_m = log_within(spec.yaw_per_roll, u[3]) * agility * moments[2] / thrust_N
-    rise_s = log_within(spec.rotor_rise_s, u[4])
-    physics = base._replace(
-        inertia_kg_m2=moments,
-        motor_torque_m=jnp.concatenate([base.motor_torque_m[:2], yaw_m * spin[None]]),
-        motor_min_N=jnp.zeros_like(base.motor_max_N),
-        motor_max_N=jnp.ones_like(base.motor_max_N) * thrust_N,
-    )
-    return Drawn(
-        physics,
-        Rotors(rise_s, rise_s * within(spec.fall_per_rise, u[5]), within(spec.thrust_curve, u[6])),
-        within(spec.drag_1_s, u[7]) * base.mass_kg * jnp.ones(3),
-        spec.force_surplus * jnp.minimum(ratio - 1.0, 1.5) * u[8] ** 2,
-    )
+    @model_validator(mode="after")
+    def _possible(self) -> "VehicleDistribution":
+        if self.thrust_per_weight[0] < LEAST_THRUST_PER_WEIGHT:
+            least, found = LEAST_THRUST_PER_WEIGHT, self.thrust_per_weight[0]
+            raise ValueError(f"expected a thrust_per_weight of at least {least:g}, found {found:g}")
+        if self.moment_z_factor > 1.0 + 1.0 / self.pitch_factor[1]:
+            raise ValueError(
+                "expected a moment_z_factor of at most 1 + 1/pitch_factor, as of a rigid body, found"
+                f" {self.moment_z_factor:g}"
+            )
+        return self
 
 
 def shipped_distributions() -> list[str]:

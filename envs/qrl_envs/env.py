@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from qrl_envs import distribution, measures, pendulum, plant, quadrotor, rewards, symmetry
+from qrl_envs import measures, own_vehicle, pendulum, plant, quadrotor, rewards, symmetry
 from qrl_envs import task as tasks
 from qrl_envs.reference import Random, Reference
 from qrl_envs.symmetry import Symmetry
@@ -26,6 +26,7 @@ from qrl_envs.target import Figure, Motion, Target
 from qrl_envs.task import PendulumTask, QuadrotorTask, Task
 from qrl_envs.uncertainty import Uncertainty
 
+WORST_S = 0.5
 WORLD_STREAM = 1_000_003  # folded into a start's key, so that a world does not share the start's random numbers
 
 
@@ -275,6 +276,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
         self._integrator = plant.integrator(task)
         self._reference = self._followed(task.reference, task.episode_s, anywhere=True)
+        self._calibrating = False
         motors, integrals = len(task.vehicle.motors), self._integrator.size if self._integrator else 0
         ahead = 3 * len(task.preview_s)
         self.policy_observation_size = 18 + ahead + task.memory.previous_action * motors + integrals
@@ -331,11 +333,11 @@ class RealQuadrotorEnv(QuadrotorEnv):
         stream, more = jax.random.fold_in(rng, WORLD_STREAM), None
         draws, others = plant.DRAWS + self.action_size, self._reference.draws if self._reference else 0
         vehicles, own = self.task.distribution, None
-        u = jax.random.uniform(stream, (draws + others + (distribution.DRAWS if vehicles else 0),))
+        u = jax.random.uniform(stream, (draws + others + (own_vehicle.DRAWS if vehicles else 0),))
         if self._layout.gusts or self._layout.positions:  # apart, so that what was drawn before these were there stays
-            more = jax.random.uniform(jax.random.fold_in(stream, 0), (plant.MORE_DRAWS,))
+            more = jax.random.uniform(jax.random.fold_in(rng, WORLD_STREAM + 1), (plant.MORE_DRAWS,))
         if vehicles:
-            own = distribution.draw(vehicles, params.physics, self.task.vehicle, u[draws + others :])
+            own = own_vehicle.draw(vehicles, params.physics, u[draws + others :])
         world = plant.draw(params.ranges, params.physics, u[:draws], self._layout, more, own)
         body, origin_m = self._start(params, rng), 0.0
         if self._reference:
@@ -367,9 +369,27 @@ class RealQuadrotorEnv(QuadrotorEnv):
 
     def evaluation(self) -> Evaluation:
         plan, spec = super().evaluation(), self.task.evaluation
-        if isinstance(env := plan.env, RealQuadrotorEnv):
+        if isinstance(env := plan.env, RealQuadrotorEnv) and not self._calibrating:
             env._reference = self._followed(spec.reference, spec.duration_s, anywhere=False)
         return plan
+
+    def calibrating(self) -> "RealQuadrotorEnv":
+        """A copy that evaluates on what is followed in training: an exported policy must be ready for all of it."""
+        other = copy.copy(self)
+        other._calibrating = True
+        return other
+
+    def _reward_out_of_bounds(self, params: Params) -> chex.Array:
+        """To track, also with the greatest body rate, turned about, and every action changed as far as it can."""
+        if self.task.reward.form != "track":
+            return super()._reward_out_of_bounds(params)
+        distance_m, rate = params.bounds["distance_m"], params.bounds["body_rate_rad_s"]
+        zero, one = jnp.zeros_like(distance_m), jnp.ones_like(distance_m)
+        above, about = jnp.stack([zero, zero, distance_m]), jnp.stack([zero, zero, zero, one])
+        # A velocity has no bound: that of a distance in WORST_S.
+        twist = quadrotor.Twist(above / WORST_S, jnp.stack([rate, zero, zero]))
+        actions = jnp.stack([one] * self.action_size)
+        return params.reward(quadrotor.Body(quadrotor.Pose(above, about), twist), actions, -actions)
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         plain = super().symmetry(u)

@@ -24,7 +24,7 @@ class ActionPort(NamedTuple):
     scale: float
     low: float
     high: float
-    safe: float  # command when an input is invalid: hover thrust, zero torque
+    safe: float  # command when an input is invalid: that of hover, zero torque
     position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
     quantity: str | None = None  # where `unit` does not say it
@@ -77,7 +77,7 @@ def actions(task: Task) -> list[ActionPort]:
             ActionPort(
                 name=f"f{i}",
                 unit="1",
-                frame="rotor speed, of its greatest",
+                frame="rotor speed, of its greatest; safe: that of the vehicle of the task's file in hover",
                 offset=0.5,
                 scale=0.5,
                 low=0.0,

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 
 from qrl_envs import gusts, integrate, quadrotor, rotation, rotors, sensors
-from qrl_envs.distribution import Drawn
 from qrl_envs.gusts import Gust
+from qrl_envs.own_vehicle import Drawn
 from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
 from qrl_envs.rotors import Rotors
 from qrl_envs.sensors import Fixes, History, Noise, Sensors

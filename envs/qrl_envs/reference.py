@@ -19,7 +19,9 @@ from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle
 Vector = tuple[Real, Real, Real]
 SETTLE_S = 2.0  # of an evaluation, before the error counts, unless the first lap takes longer
 LEAST_MEASURED_S = 6.0  # of an evaluation of a reference that repeats
-LONGEST_S = 600.0
+LONGEST_S = 120.0
+FARTHEST_M = 1000.0
+FASTEST_1_S = 10.0  # cycles of a figure in a second
 MOST_THRUST = 0.95  # share of a vehicle's thrust that a reference may take
 FINEST_S = 1e-3  # least distance of two times of a reference
 
@@ -72,6 +74,8 @@ class Lissajous(Spec):
             raise ValueError(f"expected whole numbers of cycles, found {list(self.cycles)}")
         if not FINEST_S <= self.period_s <= LONGEST_S:
             raise ValueError(f"expected a period_s from {FINEST_S:g} to {LONGEST_S:g}, found {self.period_s:g}")
+        if max(self.cycles) > FASTEST_1_S * self.period_s:
+            raise ValueError(f"expected at most {FASTEST_1_S:g} cycles in a second, found {list(self.cycles)}")
         return self
 
     @property
@@ -182,6 +186,8 @@ class Polynomials(Spec):
 
     @model_validator(mode="after")
     def _joined(self) -> "Polynomials":
+        if (total_s := sum(segment.duration_s for segment in self.segments)) > LONGEST_S:
+            raise ValueError(f"expected segments of at most {LONGEST_S:g} s together, found {total_s:g} s")
         for i, (one, after) in enumerate(zip(self.segments, self.segments[1:], strict=False)):
             end, begin = one.at(np.array([one.duration_s]))[0, 0], after.at(np.zeros(1))[0, 0]
             if not np.allclose(end, begin, atol=1e-2):
@@ -277,12 +283,18 @@ def evaluation_s(reference: Fixed) -> tuple[float, float]:
 
 
 def check(reference: Fixed, vehicle: Vehicle) -> None:
-    """ValueError if the vehicle has too little thrust for a reference."""
-    total_s = evaluation_s(reference)[0]
-    times = np.linspace(0.0, total_s, round(total_s * 200) + 1)
-    needed = reference.at(times).acceleration_m_s2 + [0.0, 0.0, STANDARD_GRAVITY_M_S2]
-    worst = int(np.argmax(np.linalg.norm(needed, axis=1)))
-    share = float(np.linalg.norm(needed[worst])) * vehicle.mass_kg / vehicle.total_thrust_N
+    """ValueError if the vehicle has too little thrust for a reference, or it leads too far away."""
+    total_s = reference.duration_s or evaluation_s(reference)[0]  # where it ends it may stop at once
+    times = np.linspace(0.0, total_s, round(total_s * 200) + 2)
+    found = reference.at(times)
+    if not np.abs(found.position_m).max() <= FARTHEST_M:
+        raise ValueError(f"expected a reference within {FARTHEST_M:g} m, found {np.abs(found.position_m).max():g} m")
+    # A velocity that jumps takes an acceleration that no derivative shows.
+    steps = np.diff(found.velocity_m_s, axis=0, append=found.velocity_m_s[-1:]) / times[1]
+    up = np.array([0.0, 0.0, STANDARD_GRAVITY_M_S2])
+    needed = [np.linalg.norm(acceleration + up, axis=1) for acceleration in (found.acceleration_m_s2, steps)]
+    worst = int(np.argmax(np.maximum(*needed)))
+    share = float(max(each[worst] for each in needed)) * vehicle.mass_kg / vehicle.total_thrust_N
     if not share <= MOST_THRUST:
         raise ValueError(
             f"expected a reference that the vehicle can follow: at {times[worst]:.2f} s it takes {share:.2f} of its"
@@ -294,7 +306,7 @@ def reference_data(name_or_path: str) -> dict[str, Any]:
     """The contents of a shipped reference, of a `.json`, or of a `.csv` with the columns time_s, x_m, y_m, z_m;
     BadInput with one line if there is none.
     """
-    if name_or_path.endswith(".csv"):
+    if name_or_path.lower().endswith(".csv"):
         return _csv(Path(name_or_path))
     return specfile.named("reference", "references", name_or_path)
 
@@ -309,7 +321,7 @@ COLUMNS = ("time_s", "x_m", "y_m", "z_m")
 
 def _csv(path: Path) -> dict[str, Any]:
     try:
-        with path.open(encoding="utf-8", newline="") as file:
+        with path.open(encoding="utf-8-sig", newline="") as file:
             rows = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise BadInput(f"{path}: cannot be read ({error})") from None

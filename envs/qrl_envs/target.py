@@ -26,21 +26,21 @@ class Target(NamedTuple):
 
 
 class Figure:
-    """A fixed reference in compiled code: a table of its steps. A flight begins at its own place on a lap."""
+    """A fixed reference in compiled code: a table of its steps. A flight begins at its own place."""
 
     draws = 1
 
     def __init__(self, spec: Fixed, dt_s: float, flight_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
-        self._laps = round((spec.lap_s or 0.0) / dt_s) if anywhere else 0
+        self._begins = round((spec.lap_s or spec.duration_s or 0.0) / dt_s) if anywhere else 0
         self._ahead = [round(time_s / dt_s) for time_s in ahead_s]
-        steps = round(flight_s / dt_s) + self._laps + max(self._ahead, default=0) + 2
+        steps = round(flight_s / dt_s) + self._begins + max(self._ahead, default=0) + 2
         found = spec.at(np.arange(steps) * dt_s)
         self._table = np.concatenate([found.position_m, found.velocity_m_s], axis=1).astype(np.float32)
 
     def draw(self, u: chex.Array, physics: Physics, thrust: chex.Array) -> Any:
         """Where on the figure a flight begins, from u [1] uniform in [0, 1); int32 []."""
         del physics, thrust
-        return jnp.floor(u[0] * self._laps).astype(jnp.int32)
+        return jnp.floor(u[0] * self._begins).astype(jnp.int32)
 
     def at(self, begin: Any, steps: chex.Array) -> Target:
         """The target of a flight that has made `steps` [...] and began at `begin` [...]."""
@@ -68,7 +68,8 @@ class Motion:
     draws = 19
 
     def __init__(self, spec: Random, dt_s: float, ahead_s: Sequence[float]) -> None:
-        self._spec, self._dt_s, self._ahead_s = spec, dt_s, tuple(ahead_s)
+        self._spec, self._dt_s = spec, dt_s
+        self._ahead_s = [round(time_s / dt_s) * dt_s for time_s in ahead_s]
 
     def draw(self, u: chex.Array, physics: Physics, thrust: chex.Array) -> Sines:
         """A flight's motion, from u [19] uniform in [0, 1); `thrust`: the greatest of all motors [N] []."""

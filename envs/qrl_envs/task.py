@@ -197,14 +197,21 @@ class QuadrotorTask(Spec):
             return
         if self.action != "rotor_speed":
             raise ValueError("expected action 'rotor_speed' with a distribution of vehicles: their thrusts differ")
+        uncertainty = self.uncertainty or Uncertainty()
+        if uncertainty.rotor_lag_s is not None or uncertainty.rotor_lag_factor != (1.0, 1.0):
+            raise ValueError(
+                "expected no rotor_lag in the uncertainty of a distribution of vehicles, which has its own"
+            )
         if len(self.vehicle.motors) != 4 or not self.vehicle.upright:
             raise ValueError("expected a vehicle of four motors along z with a distribution of vehicles")
 
     def _check_references(self) -> None:
         if self.preview_s and self.reference is None:
             raise ValueError("expected no preview_s without a reference")
-        if self.preview_s and max(self.preview_s) > MOST_PREVIEW_S:
-            raise ValueError(f"expected preview_s of at most {MOST_PREVIEW_S:g} s, found {max(self.preview_s):g}")
+        if self.preview_s and not self.control_period_s <= min(self.preview_s) <= max(self.preview_s) <= MOST_PREVIEW_S:
+            raise ValueError(
+                f"expected preview_s from control_period_s to {MOST_PREVIEW_S:g} s, found {list(self.preview_s)}"
+            )
         for key, found in (("reference", self.reference), ("evaluation.reference", self.evaluation.reference)):
             if found is not None and not isinstance(found, references.Random):
                 try:
@@ -401,7 +408,9 @@ def _with_parts(data: dict[str, Any], where: str, folder: Path, parts: Mapping[s
 
 def with_reference(data: dict[str, Any], reference: dict[str, Any]) -> dict[str, Any]:
     """A task object whose evaluation follows `reference`, for as long as that takes."""
-    evaluation = {k: v for k, v in data.get("evaluation", {}).items() if k not in ("duration_s", "tail_s")}
+    if not isinstance(given := data.get("evaluation", {}), dict):
+        return data
+    evaluation = {k: v for k, v in given.items() if k not in ("duration_s", "tail_s")}
     return {**data, "evaluation": {**evaluation, "reference": reference}}
 
 
@@ -454,5 +463,7 @@ def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
         raise BadInput(f"{where}: key 'extend': no shipped task '{base}'{specfile.nearest(str(base), shipped())}")
     shipped_base = _shipped(base)
     given = {key: value for key, value in data.items() if key != "extend"}
+    if not isinstance(given.get(LAGGED, {}), dict):
+        raise BadInput(f"{where}: key '{LAGGED}': expected an object")
     lagged = specfile.merge(_without(shipped_base.get(LAGGED, {}), given), given.get(LAGGED, {}))
     return specfile.merge(shipped_base, given) | {LAGGED: lagged}

@@ -30,7 +30,7 @@ from experiments.bench.process import run_with_timeout
 from experiments.output import table
 from qrl.runs import files
 from qrl.runs import record as records
-from qrl_envs import plant, quadrotor, rotors
+from qrl_envs import plant, quadrotor, reference, rotors
 from qrl_envs.quadrotor import Body, Disturbance, Pose, Twist
 from qrl_envs.reference import FixedReference, evaluation_s, reference_data
 from qrl_envs.specfile import build
@@ -79,7 +79,7 @@ def judge(contestants: list[Contestant], pythons: dict[str | None, Path], out: P
             continue
         vehicle = VEHICLES[contestant.words[0]]
         try:
-            kernel = kernel_of(task, vehicle, runs.get(vehicle), folder / "kernels")
+            kernel = kernel_of(task, vehicle, runs.get(task if task == "any" else vehicle), folder / "kernels")
         except (subprocess.CalledProcessError, OSError) as error:
             print(f"{key(contestant)}: no kernel, and flown without: {error}", file=sys.stderr, flush=True)
             kernel = None
@@ -171,7 +171,8 @@ def manifest_of(kernel: Path | None) -> dict[str, Any] | None:
 
 def inputs(contestant: Contestant, kernel: Path | None, starts: int, task: str) -> dict[str, Any]:
     """What the flights depend on: hashes of code, vehicle, requirements and kernel."""
-    code = [BASELINES / contestant.script, Path(kernel_flights.__file__), Path(__file__), Path(plant.__file__)]
+    modules = (kernel_flights, reference, plant)
+    code = [BASELINES / contestant.script, Path(__file__), *(Path(str(module.__file__)) for module in modules)]
     shipped = load("hover", VEHICLES[contestant.words[0]]).model_dump_json()
     return {
         "task": task,
@@ -306,14 +307,14 @@ def section(result: dict[str, Any]) -> str:
         )
     if result["outcome"] != "done":
         parts.append(f"**The judge's process did not finish: {result['outcome']}.**")
-    for reference, kind in dict.fromkeys((line.get("reference", "hover"), line["starts"]) for line in lines):
-        selected = [line for line in lines if (line.get("reference", "hover"), line["starts"]) == (reference, kind)]
+    for followed, kind in dict.fromkeys((line.get("reference", "hover"), line["starts"]) for line in lines):
+        selected = [line for line in lines if (line.get("reference", "hover"), line["starts"]) == (followed, kind)]
         conditions, controllers = (
             list(dict.fromkeys(line[name] for line in selected)) for name in ("condition", "controller")
         )
         cells = {(line["condition"], line["controller"]): cell(line) for line in selected}
         rows = [[name, *(cells.get((name, c), "") for c in controllers)] for name in conditions]
-        title = f"{reference}; starts: {kind}, {selected[0]['flights']} of them."
+        title = f"{followed}; starts: {kind}, {selected[0]['flights']} of them."
         parts += [title[0].upper() + title[1:], table(["", *controllers], rows)]
     if result["plants"]:
         head = ["the judge's plant against ours", "after [s]", "position [mm]", "velocity [mm/s]", "attitude [°]"]

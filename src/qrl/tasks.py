@@ -157,12 +157,19 @@ def _like(motors: list[Any], known: list[dict[str, Any]], where: str) -> list[di
 
     try:
         found = {quarter(motor): motor for motor in motors}
-        return [found[quarter(motor)] for motor in known]
+        if len(motors) == len(known) and all(_along_z(motor) for motor in motors):
+            return [found[quarter(motor)] for motor in known]
     except (KeyError, TypeError, ValueError):
-        places = ", ".join(f"x {p['position_m'][0]:+.2g}, y {p['position_m'][1]:+.2g}: {p['spin']:+d}" for p in known)
-        raise BadInput(
-            f"{where}: key 'motors': expected one in each quarter about body z, with the spins of {places}"
-        ) from None
+        pass
+    places = ", ".join(f"x {p['position_m'][0]:+.2g}, y {p['position_m'][1]:+.2g}: {p['spin']:+d}" for p in known)
+    raise BadInput(
+        f"{where}: key 'motors': expected one along body z in each quarter about it, with the spins of {places}"
+    )
+
+
+def _along_z(motor: dict[str, Any]) -> bool:
+    x, y, _ = motor.get("axis", (0.0, 0.0, 1.0))
+    return x == y == 0.0
 
 
 def check_task_record(record: TaskRecord, where: str) -> TaskRecord:

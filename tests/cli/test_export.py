@@ -180,9 +180,11 @@ def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], input
     assert qrl("export", run, *LEAST) == 0
     manifest = json.loads((run / "export" / "manifest.json").read_text())
     assert manifest["network"][0] == inputs
+    if task == "any":  # calibrated on the motion of training, not on the eight that is evaluated: there 1.3 m/s
+        assert max(port["range"][1] for port in manifest["obs"] if "ahead_s" in port) > 1.8
     said = {(port["unit"], port.get("quantity")) for port in manifest["act"]}
     assert said == ({("1", "rotor speed fraction")} if task == "any" else {("N", None)})
-    assert manifest["memory"]["integral"]["circle_m"] == 1.0
+    assert manifest["memory"]["integral"]["circle_m"] == (1.0 if task == "circle" else None)
 
 
 @pytest.mark.parametrize("name", shipped_vehicles())

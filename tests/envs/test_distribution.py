@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qrl_envs import distribution, plant, quadrotor, task
+from qrl_envs import own_vehicle, plant, quadrotor, task
 from qrl_envs.distribution import VehicleDistribution
 from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.specfile import BadInput
@@ -22,11 +22,9 @@ def drawn() -> Any:
     base = task.load("any")
     assert isinstance(base, task.QuadrotorTask)
     physics = quadrotor.physics(base.vehicle)
-    u = jax.random.uniform(jax.random.PRNGKey(0), (N, distribution.DRAWS))
+    u = jax.random.uniform(jax.random.PRNGKey(0), (N, own_vehicle.DRAWS))
     spec = VehicleDistribution()
-    return jax.tree.map(
-        np.asarray, jax.vmap(lambda one: distribution.draw(spec, physics, base.vehicle, one))(u)
-    ), physics
+    return jax.tree.map(np.asarray, jax.vmap(lambda one: own_vehicle.draw(spec, physics, one))(u)), physics
 
 
 def test_vehicles_are_within_their_ranges_and_fill_them(drawn: Any) -> None:
@@ -115,6 +113,9 @@ def test_each_flight_has_its_own_vehicle_and_begins_in_its_hover() -> None:
         ({"vehicle": "hexa"}, "four motors"),
         ({"distribution": {"rotor_rise_s": [0.1, 0.05]}}, "distribution.rotor_rise_s"),
         ({"distribution": "quadrotor"}, "quadrotors"),
+        ({"distribution": {"thrust_per_weight": [0.5, 2.0]}}, "thrust_per_weight"),
+        ({"distribution": {"moment_z_factor": 2.0}}, "rigid body"),
+        ({"uncertainty": {"rotor_lag_factor": [0.5, 2.0]}}, "rotor_lag"),
     ],
 )
 def test_a_distribution_that_cannot_be_flown_is_refused(changes: dict[str, Any], words: str) -> None:

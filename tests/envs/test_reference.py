@@ -35,6 +35,12 @@ FIXED: dict[str, dict[str, Any]] = {
 }
 
 
+def jumping(duration_s: float) -> dict[str, Any]:
+    """Polynomials whose velocity turns about where they join."""
+    there, back = ({"duration_s": duration_s, "x_m": x, "y_m": [0], "z_m": [0]} for x in ([0, 5], [5 * duration_s, -5]))
+    return {"form": "polynomials", "segments": [there, back]}
+
+
 def built(name: str) -> Any:
     return specfile.build(FixedReference, FIXED[name], name)
 
@@ -109,8 +115,8 @@ def test_a_figure_in_flight_is_the_figure(name: str) -> None:
     figure = Figure(spec, dt, 4.0, [0.1, 0.5], anywhere=True)
     begins = jnp.stack([figure.draw(jnp.array([u]), None, None) for u in (0.0, 0.3, 0.999)])  # pyright: ignore[reportArgumentType]
     lap = spec.lap_s or 0.0
-    assert (np.asarray(begins) > 0).tolist() == ([False, True, True] if lap else [False] * 3)
-    assert float(begins[-1]) * dt < max(lap, dt)
+    assert (np.asarray(begins) > 0).tolist() == [False, True, True]
+    assert float(begins[-1]) * dt < (lap or spec.duration_s)
     steps = jnp.array([0, 7, 150])
     target = figure.at(begins, steps)
     times = np.asarray(begins + steps) * dt
@@ -210,6 +216,10 @@ def test_flights_start_about_the_reference_and_end_far_from_it() -> None:
     moved = one.pipeline_state._replace(x=x._replace(body=x.body._replace(pose=far)))
     after = env.step(one.replace(pipeline_state=moved), jnp.zeros(4))
     assert after.info["out_of_bounds"] == 1
+    reward = env.params.reward  # no flight within the bounds is worse
+    inside = quadrotor.Twist(jnp.array([0.0, 0.0, 20.0]), jnp.array([0.0, 99.0, 0.0]))
+    worst = quadrotor.Body(quadrotor.Pose(jnp.array([0.0, 19.9, 0.0]), jnp.array([0.0, 0.0, 0.0, 1.0])), inside)
+    assert after.reward <= reward(worst, jnp.ones(4), -jnp.ones(4))
 
 
 def test_an_evaluation_flies_its_own_reference_from_its_beginning() -> None:
@@ -238,6 +248,13 @@ def test_an_evaluation_flies_its_own_reference_from_its_beginning() -> None:
         ({"form": "waypoints", "position_m": [[0, 0, 0], [0, 0, 0]], "speed_m_s": 1.0}, ["times"]),
         ({"form": "waypoints", "position_m": [[0, 0, 0], [1, 0, 0]], "times_s": [0.0, 0.05]}, ["thrust"]),
         ({"form": "loop"}, ["form", "lissajous", "loop"]),
+        (
+            {"form": "lissajous", "amplitude_m": [1, 1, 0], "cycles": [900, 2, 0], "period_s": 5.0},
+            ["cycles in a second"],
+        ),
+        ({"form": "point", "position_m": [1e6, 0, 0]}, ["within 1000 m"]),
+        (jumping(1e13), ["120 s together"]),
+        (jumping(1.0), ["thrust"]),
     ],
 )
 def test_a_reference_that_cannot_be_followed_is_refused(

@@ -58,7 +58,8 @@ def evaluate(args: argparse.Namespace) -> int:
         results = [_evaluated(seed, eval_envs, args.checkpoints, task) for seed in seeds]
         comparison = _comparison(baselines, others, eval_envs)
     parts = {"baselines": comparison.baselines, "beside": comparison.beside}
-    table = [{**result, **{name: part for name, part in parts.items() if part}} for result, _ in results]
+    flown = {key: value for key in ("vehicle", "reference") if (value := getattr(args, key)) is not None}
+    table = [{**result, **flown, **{name: part for name, part in parts.items() if part}} for result, _ in results]
     for seed, result, (_, flights) in zip(seeds, table, results, strict=True):
         result |= verdict(config.task, result["success"]).entry
         files.write_json(seed.folder / "evaluation.json", result)
@@ -70,11 +71,12 @@ def evaluate(args: argparse.Namespace) -> int:
                 off_nominal.draw(seed.folder / "off_nominal.png", task, by_pilot)
     if config.seeds > 1:
         files.write_json(args.run / "evaluation.json", table)
-    console.print(f"{config.task.name}: {args.starts:,} fresh starts, deterministic policy")
+    what = "".join(f", {key} {value}" for key, value in flown.items())
+    console.print(f"{config.task.name}{what}: {args.starts:,} fresh starts, deterministic policy")
     _print(table, comparison, named)
     for name in CONTROLLERS if baselines else ():
         if name not in comparison.baselines:
-            console.print(f"{name}: not available for this vehicle")
+            console.print(f"{name}: not available for this task and vehicle")
     return DONE
 
 
@@ -92,6 +94,8 @@ def _conditions(folder: Path, config: RunConfig, task: Task | None) -> dict[str,
         raise BadInput(
             f"{folder}: --off-nominal: expected a run of hover, circle or another quadrotor, found '{config.task.name}'"
         )
+    if task.distribution:
+        raise BadInput(f"{folder}: --off-nominal: expected --vehicle too, for a policy of any vehicle")
     return conditions(task)
 
 

@@ -41,7 +41,8 @@ def view(args: argparse.Namespace) -> int:
         padded = np.resize(starts, -(-len(starts) // LANES) * LANES)
         flights = run.fly(evaluation_starts()[padded])
         observations, actions = (np.asarray(x[: len(starts)]) for x in (flights.observations, flights.actions))
-        title = f"{config.task.name}, seed {run.config.seed}, step {run.env_steps:,}"
+        flown = "".join(f", {given}" for given in (args.vehicle, args.reference) if given is not None)
+        title = f"{config.task.name}{flown}, seed {run.config.seed}, step {run.env_steps:,}"
         page = viewer.page(task, title, Recording(starts, observations, actions))
         path = args.out or folder / "view.html"
         files.replace_text(path, page)

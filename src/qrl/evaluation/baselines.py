@@ -54,8 +54,10 @@ class Baselines:
 
 
 def _controllers(task: QuadrotorTask) -> dict[str, Controller]:
-    """The controllers that exist for this vehicle: one that cannot be stabilized has no regulator."""
-    made = {}
+    """The controllers that exist for this task: they give thrusts; what cannot be stabilized has no regulator."""
+    made: dict[str, Controller] = {}
+    if task.action != "thrust":
+        return made
     for name, make in CONTROLLERS.items():
         try:
             made[name] = make(task)

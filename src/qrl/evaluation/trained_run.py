@@ -28,6 +28,7 @@ from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
 from qrl_envs import task as task_spec
+from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.plant import integrator
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task
@@ -52,7 +53,7 @@ class TrainedRun:
         self.task = tasks.spec(config.task) if config.task.spec else None  # None: not one of qrl_envs
         self._programs = programs
         self._learner = learner
-        self._fly_host = jax.jit(self._host_flights)
+        self._fly_host = jax.jit(self._host_flights, static_argnums=0)
 
     @classmethod
     def load(cls, folder: Path, checkpoint: int = -1, programs: FlightPrograms | None = None) -> "TrainedRun":
@@ -85,9 +86,15 @@ class TrainedRun:
         return self._programs.fly(self._learner, env or self.env, starts)
 
     def fly_host_policy(
-        self, step: HostStep, memory: NDArray[np.integer], starts: chex.PRNGKey, from_envelope: float = 0.0
+        self,
+        step: HostStep,
+        memory: NDArray[np.integer],
+        starts: chex.PRNGKey,
+        from_envelope: float = 0.0,
+        calibrating: bool = False,
     ) -> Flights:
-        """Flights of a NumPy policy in the run's environment; a fraction `from_envelope` starts in the envelope.
+        """Flights of a NumPy policy in the run's environment; a fraction `from_envelope` starts in the envelope. Where
+        the task tracks a reference, `calibrating` follows those of training.
 
         `memory` [starts, S] is that of the first step. Compiled once for each size of it; the policy runs on the host
         (`jax.pure_callback`).
@@ -101,9 +108,13 @@ class TrainedRun:
 
         self._host_policy = normalized
         in_envelope = jnp.arange(len(starts)) >= (1.0 - from_envelope) * len(starts)
-        return jax.tree.map(np.asarray, self._fly_host(memory.astype(np.int32), starts, in_envelope))
+        return jax.tree.map(np.asarray, self._fly_host(calibrating, memory.astype(np.int32), starts, in_envelope))
 
-    def _host_flights(self, memory: chex.Array, starts: chex.PRNGKey, in_envelope: chex.Array) -> Flights:
+    def _host_flights(
+        self, calibrating: bool, memory: chex.Array, starts: chex.PRNGKey, in_envelope: chex.Array
+    ) -> Flights:
+        env = self.env.calibrating() if calibrating and isinstance(self.env, RealQuadrotorEnv) else self.env
+
         def policy(memory: chex.Array, observation: chex.Array) -> tuple[chex.Array, chex.Array]:
             action = jax.ShapeDtypeStruct((*observation.shape[:-1], self.env.action_size), jnp.float32)
             shapes = jax.ShapeDtypeStruct(memory.shape, jnp.int32), action
@@ -114,7 +125,7 @@ class TrainedRun:
             return jax.tree.map(partial(jnp.where, in_envelope), *states)
 
         return flights.fly_with_memory(
-            self.env,
+            env,
             policy,
             memory,
             starts,
@@ -138,7 +149,7 @@ class TrainedRun:
 
         starts = calibration_starts(calibration.STARTS)
         none = np.zeros((len(starts), 0), np.int32)
-        flown = self.fly_host_policy(step, none, starts, from_envelope=calibration.FROM_ENVELOPE)
+        flown = self.fly_host_policy(step, none, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
         return replace(policy, calibration=calibration.select(flown_inputs(policy, flown)))
 
     def float_policy(self, memory: Memory | None = None) -> Policy:

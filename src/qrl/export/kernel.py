@@ -85,9 +85,9 @@ class Turn:
     vectors: int  # how many follow the 18 measurements
     last: int  # numbers of the vector at the end: 3, or 2 of a horizontal one; 0: there is none
     up: int  # in [0, 15]
-    position: int  # in [15, 29]
-    velocity: int  # in [15, 29]
-    ahead: int  # in [15, 29]
+    position: int  # in [14, 29]
+    velocity: int  # in [14, 29]
+    ahead: int  # in [14, 29]
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ def _check_fields(kernel: Kernel) -> None:
     if turn := kernel.turn:
         ranges += [
             ("an input's shift", np.array(turn.up), 0, 15),
-            ("an input's shift", np.array([turn.position, turn.velocity, turn.ahead]), 15, 29),
+            ("an input's shift", np.array([turn.position, turn.velocity, turn.ahead]), 14, 29),
         ]
     if memory := kernel.memory:
         ranges += [

@@ -176,7 +176,7 @@ def _turn(frame: BodyFrame, lsb: Floats, wanted: Floats) -> tuple[integers.Turn,
     groups = [wanted[:axes], wanted[axes : axes + 3], wanted[axes + 3 : axes + 6], wanted[ahead]]
     finest = [lsb[6], *(2.0 * lsb[0] * lsb[at] for at in (9, 12, 18 if frame.vectors else 12))]
     shifts, steps = [], []
-    for group, fine, (least, most) in zip(groups, finest, [(0, 15), *[(15, 29)] * 3], strict=True):
+    for group, fine, (least, most) in zip(groups, finest, [(0, 15), *[(14, 29)] * 3], strict=True):
         shifts.append(int(np.clip(np.floor(np.log2(group.min(initial=1e30) / fine)), least, most)))
         steps.append(np.full(len(group), fine * 2.0 ** shifts[-1]))
     turn = integers.Turn(frame.heading, frame.vectors, frame.last, *shifts)
