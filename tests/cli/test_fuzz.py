@@ -70,7 +70,7 @@ def reads_task(path: Path) -> None:
     run = request.run_config(str(path), None, record.ConfigFile(), {}, None, None)
     starts(run.task, run.learner, path)
     task = task_spec.load(str(path))
-    assert len(io_spec.observations(task)) in (3, 18)
+    assert len(io_spec.observations(task)) in (3, 18, 27)
     assert all(action.low <= action.safe <= action.high for action in io_spec.actions(task))
 
 
