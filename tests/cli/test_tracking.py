@@ -38,7 +38,7 @@ def test_a_policy_of_any_vehicle_flies_another_along_a_file(
 
 
 def test_what_cannot_be_flown_is_said_in_a_line(run: Path, trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "expected one in each quarter" in complaint(capsys, "evaluate", run, "--vehicle", "hexa")
+    assert "expected one along body z in each quarter" in complaint(capsys, "evaluate", run, "--vehicle", "hexa")
     assert "did you mean 'eight'" in complaint(capsys, "evaluate", run, "--reference", "eigth")
     assert "--vehicle: expected a policy of any vehicle" in complaint(capsys, "evaluate", trained, "--vehicle", "hexa")
     assert "--reference: expected a task that tracks" in complaint(capsys, "view", trained, "--reference", "eight")
