@@ -34,11 +34,8 @@ class Kinematics(NamedTuple):
     acceleration_m_s2: np.ndarray
 
 
-class Point(Spec):
-    """Stays at a point."""
-
-    form: Literal["point"]
-    position_m: Vector = (0.0, 0.0, 0.0)
+class Base(Spec):
+    """What references known beforehand have in common; each has `at(times_s [n]) -> Kinematics`, too."""
 
     @property
     def lap_s(self) -> float | None:
@@ -50,12 +47,19 @@ class Point(Spec):
         """Time after which it stays where it is, or None."""
         return None
 
+
+class Point(Base):
+    """Stays at a point."""
+
+    form: Literal["point"]
+    position_m: Vector = (0.0, 0.0, 0.0)
+
     def at(self, times_s: np.ndarray) -> Kinematics:
         zero = np.zeros((len(times_s), 3))
         return Kinematics(zero + self.position_m, zero, zero)
 
 
-class Lissajous(Spec):
+class Lissajous(Base):
     """center + amplitude_m·sin(2π·cycles·t/period_s + phase_rad) along each axis.
 
     A figure-eight has the cycles 1, 2, 0; a circle 1, 1, 0 and a phase of π/2 along x.
@@ -82,10 +86,6 @@ class Lissajous(Spec):
     def lap_s(self) -> float | None:
         return self.period_s
 
-    @property
-    def duration_s(self) -> float | None:
-        return None
-
     def at(self, times_s: np.ndarray) -> Kinematics:
         rate = 2.0 * np.pi * np.array(self.cycles) / self.period_s
         angle, size = rate * np.asarray(times_s)[:, None] + self.phase_rad, np.array(self.amplitude_m)
@@ -93,7 +93,7 @@ class Lissajous(Spec):
         return Kinematics(position, size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
 
 
-class Circle(Spec):
+class Circle(Base):
     """A horizontal circle about center_m; a speed above 0 is counter-clockwise seen from above."""
 
     form: Literal["circle"]
@@ -111,10 +111,6 @@ class Circle(Spec):
     def lap_s(self) -> float | None:
         return 2.0 * np.pi * self.radius_m / abs(self.speed_m_s)
 
-    @property
-    def duration_s(self) -> float | None:
-        return None
-
     def at(self, times_s: np.ndarray) -> Kinematics:
         rate = self.speed_m_s / self.radius_m
         angle = rate * np.asarray(times_s)
@@ -123,7 +119,7 @@ class Circle(Spec):
         return Kinematics(outward + self.center_m, along, -(rate**2) * outward)
 
 
-class Waypoints(Spec):
+class Waypoints(Base):
     """The motion of least snap through points at given times, from rest to rest, as a spline of degree 7."""
 
     form: Literal["waypoints"]
@@ -135,9 +131,7 @@ class Waypoints(Spec):
     def _timed(self) -> "Waypoints":
         if (self.times_s is None) == (self.speed_m_s is None):
             raise ValueError("expected either times_s or speed_m_s")
-        if self.times_s is not None and len(self.times_s) != len(self.position_m):
-            raise ValueError(f"expected a time for each of {len(self.position_m)} points, found {len(self.times_s)}")
-        _check_times(self._times)
+        _check_times(tuple(self._times), len(self.position_m))  # also by speed: points in one place have one time
         return self
 
     @property
@@ -146,10 +140,6 @@ class Waypoints(Spec):
             return np.array(self.times_s)
         legs = np.linalg.norm(np.diff(np.array(self.position_m), axis=0), axis=1)
         return np.concatenate([[0.0], np.cumsum(legs)]) / (self.speed_m_s or 1.0)
-
-    @property
-    def lap_s(self) -> float | None:
-        return None
 
     @property
     def duration_s(self) -> float | None:
@@ -178,7 +168,7 @@ class Segment(Spec):
         return np.stack([np.stack([(s.deriv(order) if order else s)(t) for s in series], -1) for order in (0, 1, 2)])
 
 
-class Polynomials(Spec):
+class Polynomials(Base):
     """Polynomials one after the other, as trajectory planners and the Crazyflie's firmware give them."""
 
     form: Literal["polynomials"]
@@ -193,10 +183,6 @@ class Polynomials(Spec):
             if not np.allclose(end, begin, atol=1e-2):
                 raise ValueError(f"expected segments that join, found {end} m at the end of {i} and {begin} m after it")
         return self
-
-    @property
-    def lap_s(self) -> float | None:
-        return None
 
     @property
     def duration_s(self) -> float | None:
@@ -214,7 +200,7 @@ class Polynomials(Spec):
         return Kinematics(*found)
 
 
-class Samples(Spec):
+class Samples(Base):
     """Positions at times, joined by a cubic spline; as a CSV file with the columns time_s, x_m, y_m, z_m has them."""
 
     form: Literal["samples"]
@@ -223,14 +209,8 @@ class Samples(Spec):
 
     @model_validator(mode="after")
     def _timed(self) -> "Samples":
-        if len(self.times_s) != len(self.position_m):
-            raise ValueError(f"expected a time for each of {len(self.position_m)} points, found {len(self.times_s)}")
-        _check_times(np.array(self.times_s))
+        _check_times(self.times_s, len(self.position_m))
         return self
-
-    @property
-    def lap_s(self) -> float | None:
-        return None
 
     @property
     def duration_s(self) -> float | None:
@@ -262,7 +242,9 @@ FixedReference = Annotated[Fixed, Field(discriminator="form")]
 Reference = Annotated[Fixed | Random, Field(discriminator="form")]
 
 
-def _check_times(times_s: np.ndarray) -> None:
+def _check_times(times_s: tuple[float, ...], points: int) -> None:
+    if len(times_s) != points:
+        raise ValueError(f"expected a time for each of {points} points, found {len(times_s)}")
     if times_s[0] != 0.0 or np.diff(times_s).min() < FINEST_S or times_s[-1] > LONGEST_S:
         raise ValueError(
             f"expected times from 0 on, each at least {FINEST_S:g} s after the one before, to at most {LONGEST_S:g} s"
