@@ -41,6 +41,9 @@ def speed_of(curve: chex.Array, fraction: chex.Array) -> chex.Array:
 
 def after(parameters: Rotors, speed: chex.Array, set_point: chex.Array, time_s: chex.Array) -> chex.Array:
     """Speeds after `time_s` [] at a constant set-point; [N], [N] -> [N]. A time constant of 0 follows at once."""
-    lag_s = jnp.where(set_point > speed, parameters.rise_s, parameters.fall_s)
-    left = jnp.where(lag_s > TINY, jnp.exp(-time_s / jnp.maximum(lag_s, TINY)), 0.0)
+
+    def left_of(lag_s: chex.Array) -> chex.Array:  # not of each rotor: constant during a flight
+        return jnp.where(lag_s > TINY, jnp.exp(-time_s / jnp.maximum(lag_s, TINY)), 0.0)
+
+    left = jnp.where(set_point > speed, left_of(parameters.rise_s), left_of(parameters.fall_s))
     return set_point + (speed - set_point) * left

@@ -60,6 +60,7 @@ class Sines(NamedTuple):
     amplitude_m: chex.Array  # [3, 2]
     rate_rad_s: chex.Array  # [3, 2]
     phase_rad: chex.Array  # [3, 2]
+    ahead: tuple[chex.Array, ...]  # cosine and sine [2, 3, 2] of rate·time, for each time ahead
 
 
 class Motion:
@@ -84,17 +85,18 @@ class Motion:
         most = spec.acceleration_share * physics.gravity_m_s2 * jnp.sqrt(jnp.maximum(0.8 * lift**2 - 1.0, 0.05))
         needed = jnp.linalg.norm(jnp.sum(size * rate**2, axis=1))
         size = size * jnp.minimum(1.0, jnp.clip(most, 0.5, 8.0) / needed) * (u[0] < spec.moving)
-        return Sines(size, rate, 2.0 * jnp.pi * phases)
+        ahead = tuple(jnp.stack([jnp.cos(rate * time_s), jnp.sin(rate * time_s)]) for time_s in self._ahead_s)
+        return Sines(size, rate, 2.0 * jnp.pi * phases, ahead)
 
     def at(self, motion: Sines, steps: chex.Array) -> Target:
         """As `Figure.at`."""
-        size, rate, phase = motion
+        size, rate, phase, ahead = motion
         angle = rate * (steps * self._dt_s) + phase
         sine, cosine = jnp.sin(angle), jnp.cos(angle)
         speed = size * rate
         velocity = jnp.sum(speed * cosine, axis=1)
         preview = []
-        for time_s in self._ahead_s:  # by the sum of angles: of the rate alone, which is constant during a flight
-            later = cosine * jnp.cos(rate * time_s) - sine * jnp.sin(rate * time_s)
+        for turned in ahead:  # by the sum of angles: cosine and sine of the rate alone are constant during a flight
+            later = cosine * turned[0] - sine * turned[1]
             preview.append(jnp.sum(speed * later, axis=1) - velocity)
         return Target(jnp.sum(size * sine, axis=1), velocity, jnp.concatenate(preview) if preview else velocity[:0])

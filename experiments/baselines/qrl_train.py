@@ -44,7 +44,7 @@ def numpy_policy(trainer: Trainer) -> Callable[[Any], Act]:
 
     @jax.jit
     def mean(state: Any, o: Any) -> Any:
-        return jnp.clip(learner.policy_mean(spec, hyper, learner.deployed(spec, state), o), -1.0, 1.0)
+        return jnp.clip(learner.act(spec, hyper, learner.deployed(spec, state), (), o)[1], -1.0, 1.0)
 
     return lambda member: lambda observation: np.asarray(mean(member, jnp.asarray(observation, jnp.float32)))
 

@@ -117,7 +117,7 @@ def act_policy(trainer: Trainer, call: Call) -> Any:
     state = state._replace(params=perturb(state.params, call.tiny))
 
     def step(_: None, observation: chex.Array) -> Any:
-        return None, learner.policy_mean(trainer.setup.spec, hyper, state, observation)
+        return None, learner.act(trainer.setup.spec, hyper, state, (), observation)[1]
 
     return jax.lax.scan(step, None, newest_unroll(trainer, call.inputs)[0])[1]
 

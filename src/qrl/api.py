@@ -54,13 +54,14 @@ class DeployedPolicy:
     def __call__(self, observation: ArrayLike) -> NDArray[np.float64]:
         return self._numpy(inputs_in_si(self._numpy, np.asarray(observation)))
 
-    def init_memory(self) -> tuple[()]:
-        """Memory at the start of a flight; empty for a feed-forward policy."""
-        return ()
+    def init_memory(self, *lanes: int) -> Any:
+        """Memory at the start of so many flights, [*lanes, H]; () of a feed-forward policy."""
+        return self._run.initial_memory(*lanes)
 
     def apply(self, memory: Any, observation: chex.Array) -> tuple[Any, chex.Array]:
         """Next memory and action; [..., F] -> [..., A]."""
-        return memory, jnp.clip(self._run.policy_mean(jnp.asarray(observation)), -1.0, 1.0)
+        memory, action = self._run.act(memory, jnp.asarray(observation))
+        return memory, jnp.clip(action, -1.0, 1.0)
 
 
 class Run:

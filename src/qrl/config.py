@@ -89,6 +89,11 @@ class Config(BaseModel):
     )
 
     policy_hidden_layer_sizes: Static[tuple[Count, ...]] = Field(description="hidden layers of the policy network")
+    policy_gru_size: Static[Count | None] = Field(
+        default=None,
+        exclude_if=lambda x: x is None,  # a run of before it was there has the same fingerprint
+        description="units of a gated recurrent unit after the policy's hidden layers; null: none, feed-forward",
+    )
     critic_hidden_layer_sizes: Static[tuple[Count, ...]] = Field(description="hidden layers of the value network")
     activation: Static[Literal["relu", "tanh"]] = Field(description="activation of both networks")
     observation_scale: Traced[tuple[Positive, ...] | None] = Field(
@@ -156,6 +161,8 @@ class Config(BaseModel):
                     "expected updates_per_unroll minibatches of batch_size trajectories that make whole passes over"
                     f" num_envs = {self.num_envs} with sampling epochs"
                 )
+        if self.policy_gru_size and self.symmetries:
+            raise ValueError("expected symmetries false with policy_gru_size: a stored memory cannot be transformed")
         for name in ("num_envs", "batch_size", *(["apg_num_envs"] if self.num_apg_updates else [])):
             if (value := getattr(self, name)) % self.shard_count:
                 raise ValueError(f"expected {name} to be a multiple of num_shards = {self.shard_count}, found {value}")

@@ -17,7 +17,8 @@ from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
 from qrl.algorithm.types import Env, State, TaskEnv, info_flag
 from qrl.config import Hyperparameters
 
-Mean = Callable[[chex.Array], chex.Array]  # observations [..., F] -> actions [..., A]
+# memory [n, H] or (), observations [n, F] -> next memory, mean actions [n, A]
+Act = Callable[[Any, chex.Array], tuple[Any, chex.Array]]
 
 
 @jax.custom_vjp
@@ -46,14 +47,21 @@ _bounded.defvjp(_bounded_forward, _bounded_backward)
 
 
 def returns(
-    env: Env, mean: Mean, sigma: chex.Array, keys: chex.PRNGKey, steps: int, cotangent_norm: chex.Array | None = None
+    env: Env,
+    policy: Act,
+    memory: Any,
+    sigma: chex.Array,
+    keys: chex.PRNGKey,
+    steps: int,
+    cotangent_norm: chex.Array | None = None,
 ) -> tuple[chex.Array, chex.Array]:
     """For each of `keys` [n] a flight of `steps` from a fresh start: sum of its rewards, and whether it is complete.
 
-    Actions are clip(mean(observation) + sigma·noise, −1, 1). A flight that ends early is not complete. It is held where
+    Actions are clip(mean + sigma·noise, −1, 1), where policy(memory, observation) gives the next memory and the mean;
+    `memory` is that of the first step. A flight that ends early is not complete. It is held where
     it ended, since what overflows has no gradient, and is charged for the steps that are left: the last reward each, or
     0 if that was above 0 and the flight was not out of bounds. So ending never pays. With `cotangent_norm` the gradient
-    of a flight's return with respect to its state after any step is cut to that norm: long flights of a lagged vehicle
+    of a flight's return with respect to its state and the policy's memory after any step is cut to that norm: long flights of a lagged vehicle
     are chaotic, and a few of them would drown all others.
     """
     env = adapt(env)
@@ -69,20 +77,23 @@ def returns(
     def changing_of(state: State) -> State:
         return jax.tree.map(lambda x, same: None if same else x, state, constant)
 
-    def step(carry: tuple[State, chex.Array], noise: chex.Array) -> tuple[tuple[State, chex.Array], chex.Array]:
-        changing, alive = carry
+    def step(carry: tuple[State, Any, chex.Array], noise: chex.Array) -> tuple[tuple[State, Any, chex.Array], Any]:
+        changing, memory, alive = carry
         state = jax.tree.map(lambda x, first: first if x is None else x, changing, states, is_leaf=lambda x: x is None)
-        after = env.step_lanes(state, jnp.clip(mean(state.obs.T).T + sigma * noise, -1.0, 1.0))
+        memory, mean = policy(jax.tree.map(jnp.transpose, memory), state.obs.T)
+        memory = jax.tree.map(jnp.transpose, memory)
+        after = env.step_lanes(state, jnp.clip(mean.T + sigma * noise, -1.0, 1.0))
         charge = jnp.where(info_flag(state, "out_of_bounds"), state.reward, jnp.minimum(state.reward, 0.0))
         reward = jnp.where(alive > 0, after.reward, charge)
         changing = jax.tree.map(lambda new, old: jnp.where(alive > 0, new, old), changing_of(after), changing)
         if cotangent_norm is not None:
-            changing = changing.replace(pipeline_state=_bounded(changing.pipeline_state, cotangent_norm))
-        return (changing, alive * (1.0 - after.done)), reward
+            physical, memory = _bounded((changing.pipeline_state, memory), cotangent_norm)
+            changing = changing.replace(pipeline_state=physical)
+        return (changing, memory, alive * (1.0 - after.done)), reward
 
     # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.
-    first = changing_of(states), jnp.ones_like(states.reward)
-    (_, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, noise)
+    first = changing_of(states), jax.tree.map(jnp.transpose, memory), jnp.ones_like(states.reward)
+    (_, _, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, noise)
     return jnp.sum(rewards, axis=0), alive > 0
 
 

@@ -14,7 +14,7 @@ import optax
 from jax.flatten_util import ravel_pytree
 
 from qrl.algorithm import networks, running_statistics
-from qrl.algorithm.networks import MLP, log_density
+from qrl.algorithm.networks import GRU, MLP, Network, log_density
 from qrl.algorithm.objective import perceptron
 from qrl.algorithm.running_statistics import RunningStatistics
 from qrl.algorithm.types import Networks, Transition
@@ -38,9 +38,10 @@ class LearnerSpec(NamedTuple):
     )  # the policy network's input of it
 
     @property
-    def policy(self) -> MLP:
+    def policy(self) -> Network:
         config = self.config
-        return MLP(config.policy_hidden_layer_sizes, self.action_size, config.activation, final_gain=0.01)
+        hidden, outputs = config.policy_hidden_layer_sizes, (self.action_size, config.activation, 0.01)
+        return GRU(hidden, config.policy_gru_size, *outputs) if config.policy_gru_size else MLP(hidden, *outputs)
 
     @property
     def critic(self) -> MLP:
@@ -73,7 +74,7 @@ def init(spec: LearnerSpec, hyper: Hyperparameters, key: chex.PRNGKey) -> Learne
     policy_key, critic_key = jax.random.split(key)
     observation = jnp.zeros(spec.observation_size)
     seen = _seen(spec, observation)
-    params = Networks(spec.policy.init(policy_key, seen), spec.critic.init(critic_key, observation))
+    params = Networks(networks.init(spec.policy, policy_key, seen), spec.critic.init(critic_key, observation))
     return LearnerState(
         params=params,
         optimizer=Networks(*(_optimizer(hyper).init(ravel_pytree(network)[0]) for network in params)),
@@ -111,10 +112,17 @@ def _seen(spec: LearnerSpec, observation: chex.Array) -> chex.Array:
     return spec.policy_view(observation[..., : spec.policy_observation_size])
 
 
-def policy_mean(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, observation: chex.Array) -> chex.Array:
-    """Mean action of the policy, of observations or of what it sees of them; [..., F] -> [..., A]."""
+def initial_memory(spec: LearnerSpec, *lanes: int) -> Any:
+    """The policy's memory at the start of an episode; [*lanes, H], or () of a feed-forward policy."""
+    return networks.initial_memory(spec.policy, lanes)
+
+
+def act(
+    spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, memory: Any, observation: chex.Array
+) -> tuple[Any, chex.Array]:
+    """Next memory and mean action of the policy, of observations or of what it sees of them; [..., F] -> [..., A]."""
     seen = _seen(spec, preprocess(spec, hyper, state, observation[..., : spec.policy_observation_size]))
-    return networks.apply(spec.policy, state.params.policy, seen)
+    return networks.step(spec.policy, state.params.policy, memory, seen)
 
 
 def deployed(spec: LearnerSpec, state: LearnerState) -> LearnerState:
@@ -206,7 +214,7 @@ def targets_of(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, b
     value = networks.apply(spec.critic, state.params.critic, observation).reshape(samples)
     log_rho = jnp.zeros(samples)
     if spec.config.advantage == "pi":
-        mean = networks.apply(spec.policy, state.params.policy, _seen(spec, observation))
+        mean = _means(spec, state.params.policy, observation, batch)
         log_rho = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples) - batch.log_mu
     return jax.lax.stop_gradient(_targets(spec, hyper, state, state.params.critic, value, log_rho, batch))
 
@@ -223,7 +231,7 @@ def _loss(
     samples = batch.reward.shape
     observation = preprocess(spec, hyper, state, _flat(batch.observation))
     value = networks.apply(spec.critic, params.critic, observation).reshape(samples)
-    mean = networks.apply(spec.policy, params.policy, _seen(spec, observation))
+    mean = _means(spec, params.policy, observation, batch)
     log_pi = log_density(_flat(batch.action), mean, sigma(hyper, state)).reshape(samples)
     log_rho = jax.lax.stop_gradient(log_pi - batch.log_mu)
 
@@ -245,6 +253,15 @@ def _loss(
         policy_gradient=zero,
         value_gradient=zero,
     )
+
+
+def _means(spec: LearnerSpec, policy: chex.ArrayTree, observation: chex.Array, batch: Transition) -> chex.Array:
+    """Mean actions over a batch of trajectories, of their preprocessed observations [B·T, F]; [B·T, A].
+
+    A recurrent policy begins with the memory that it had when the trajectory was collected.
+    """
+    seen = _seen(spec, observation).reshape(*batch.reward.shape, -1)
+    return networks.unroll(spec.policy, policy, batch.memory, seen, batch.terminated + batch.truncated)
 
 
 def _flat(x: chex.Array) -> chex.Array:

@@ -1,4 +1,4 @@
-"""The Gaussian policy and the critic as flax modules, and the log-density of the policy."""
+"""The Gaussian policy, feed-forward or recurrent, and the critic as flax modules; the log-density of the policy."""
 
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +27,71 @@ class MLP(nn.Module):
             self.outputs, kernel_init=nn.initializers.orthogonal(self.final_gain), dot_general=_narrow_dot_general
         )
         return last(x)
+
+
+class GRU(nn.Module):
+    """Fully connected layers, a gated recurrent unit (Cho et al. 2014, in cuDNN's form) and a linear output.
+
+    r, z = σ(W x + U h + b), n = tanh(W_n x + b_n + r·(U_n h + c)), h' = z·h + (1 − z)·n; the output is that of h'.
+    """
+
+    hidden: tuple[int, ...]
+    units: int  # H
+    outputs: int
+    activation: str
+    final_gain: float
+
+    def setup(self) -> None:
+        square, orthogonal = nn.initializers.orthogonal(), nn.initializers.orthogonal(2.0**0.5)
+        self.layers = [nn.Dense(width, kernel_init=orthogonal) for width in self.hidden]
+        self.of_input = nn.Dense(3 * self.units, kernel_init=_each_gate(square), bias_init=_remembers)
+        self.of_memory = nn.Dense(3 * self.units, kernel_init=_each_gate(square), use_bias=False)
+        self.candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (self.units,))
+        final = nn.initializers.orthogonal(self.final_gain)
+        self.of_output = nn.Dense(self.outputs, kernel_init=final, dot_general=_narrow_dot_general)
+
+    def __call__(self, memory: chex.Array, x: chex.Array) -> tuple[chex.Array, chex.Array]:
+        """Next memory and output; [..., H], [..., F] -> [..., H], [..., outputs]."""
+        memory = self.remember(memory, self.encode(x))
+        return memory, self.output(memory)
+
+    def encode(self, x: chex.Array) -> chex.Array:
+        """What the gates are given of an input; [..., F] -> [..., 3H]."""
+        for layer in self.layers:
+            x = ACTIVATIONS[self.activation](layer(x))
+        return self.of_input(x)
+
+    def remember(self, memory: chex.Array, gates: chex.Array) -> chex.Array:
+        """The next memory; [..., H], [..., 3H] -> [..., H]."""
+        both = 2 * self.units
+        own = self.of_memory(memory)
+        r, z = jnp.split(nn.sigmoid(gates[..., :both] + own[..., :both]), 2, axis=-1)
+        n = jnp.tanh(gates[..., both:] + r * (own[..., both:] + self.candidate_bias))
+        return z * memory + (1.0 - z) * n
+
+    def output(self, memory: chex.Array) -> chex.Array:
+        """[..., H] -> [..., outputs]."""
+        return self.of_output(memory)
+
+
+Network = MLP | GRU
+
+
+def _each_gate(initializer: Any) -> Any:
+    """An initializer of three square blocks, each by itself."""
+
+    def init(key: chex.PRNGKey, shape: tuple[int, int], dtype: Any = jnp.float32) -> chex.Array:
+        keys = jax.random.split(key, 3)
+        return jnp.concatenate([initializer(k, (shape[0], shape[1] // 3), dtype) for k in keys], axis=1)
+
+    return init
+
+
+def _remembers(key: chex.PRNGKey, shape: tuple[int], dtype: Any = jnp.float32) -> chex.Array:
+    """Biases of the gates: z begins near one, so that a gradient reaches back."""
+    del key
+    units = shape[0] // 3
+    return jnp.zeros(shape, dtype).at[units : 2 * units].set(1.0)
 
 
 @jax.custom_vjp
@@ -64,6 +129,46 @@ def log_density(action: chex.Array, mean: chex.Array, sigma: float | chex.Array)
     return jnp.sum(-0.5 * z**2 - jnp.log(sigma) - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
 
 
-def apply(network: MLP, params: chex.ArrayTree, x: chex.Array) -> chex.Array:
-    """The network's output; [..., F] -> [..., outputs]."""
-    return jnp.asarray(network.apply(params, x))  # flax types its result as a union
+def apply(network: Network, params: Any, *inputs: chex.Array, method: str = "__call__") -> Any:
+    """The network's result, or that of one of its methods."""
+    return network.apply(params, *inputs, method=method)
+
+
+def init(network: Network, key: chex.PRNGKey, x: chex.Array) -> Any:
+    """Parameters of a network of inputs like x [..., F]."""
+    if isinstance(network, GRU):
+        return network.init(key, initial_memory(network, x.shape[:-1]), x)
+    return network.init(key, x)
+
+
+def initial_memory(network: Network, lanes: tuple[int, ...]) -> Any:
+    """The memory of so many lanes at the start of an episode: zeros [*lanes, H], or () of a feed-forward network."""
+    return jnp.zeros((*lanes, network.units)) if isinstance(network, GRU) else ()
+
+
+def step(network: Network, params: Any, memory: Any, x: chex.Array) -> tuple[Any, chex.Array]:
+    """Next memory and output for the inputs x; [..., F] -> [..., outputs]."""
+    if isinstance(network, GRU):
+        return apply(network, params, memory, x)
+    return memory, apply(network, params, x)
+
+
+def unroll(network: Network, params: Any, memory: Any, x: chex.Array, ended: chex.Array) -> chex.Array:
+    """Outputs over trajectories x [B, T, F], from the memory before their first steps; it starts anew after each step
+    that `ended` [B, T] an episode. As one row for each step: [B·T, outputs].
+    """
+    batch, steps = x.shape[:2]
+    flat = x.reshape(batch * steps, -1)  # one large product instead of a batched small one
+    if not isinstance(network, GRU):
+        return apply(network, params, flat)
+    gates = apply(network, params, flat, method="encode").reshape(batch, steps, -1)
+    fresh = jnp.pad(ended[:, :-1] > 0, ((0, 0), (1, 0)))
+
+    def one(memory: chex.Array, at: tuple[chex.Array, chex.Array]) -> tuple[chex.Array, chex.Array]:
+        gates, fresh = at
+        memory = jnp.where(fresh[:, None], 0.0, memory)
+        memory = apply(network, params, memory, gates, method="remember")
+        return memory, memory
+
+    _, memories = jax.lax.scan(one, memory, (gates.swapaxes(0, 1), fresh.T))
+    return apply(network, params, memories.swapaxes(0, 1).reshape(batch * steps, -1), method="output")

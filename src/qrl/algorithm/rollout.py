@@ -5,7 +5,7 @@ episode gets a new draw, and the observation before reset is recorded.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -32,12 +32,19 @@ class Lanes(NamedTuple):
     reset_count: chex.Array  # [N] int32: which of its starts that is
     next_state_used: chex.Array  # [N] bool
     num_early: chex.Array  # [N] int32: episodes so far that ended before their last step
+    memory: Any = ()  # [N, H] the policy's; () for none
 
 
 def init(
-    env: TaskEnv, key: chex.PRNGKey, lane_id: chex.Array, num_lanes: int, max_episode_steps: int, unroll_length: int
+    env: TaskEnv,
+    key: chex.PRNGKey,
+    lane_id: chex.Array,
+    num_lanes: int,
+    max_episode_steps: int,
+    unroll_length: int,
+    memory: Any = (),
 ) -> Lanes:
-    """The lanes `lane_id` [N] of a run's `num_lanes`, at their first starts.
+    """The lanes `lane_id` [N] of a run's `num_lanes`, at their first starts, with the policy's initial `memory`.
 
     They are staggered by multiples of an unroll, so that episodes do not end together.
     """
@@ -45,7 +52,7 @@ def init(
     count = jnp.zeros(lane_id.shape, jnp.int32)
     state = jax.vmap(env.reset)(_start_keys(key, lane_id, count))
     steps = lane_id * (max_episode_steps // unroll_length) // num_lanes * unroll_length
-    return Lanes(lane_id, state, steps.astype(jnp.int32), none, state, count, ~none, count)
+    return Lanes(lane_id, state, steps.astype(jnp.int32), none, state, count, ~none, count, memory)
 
 
 def _start_keys(key: chex.PRNGKey, lane_id: chex.Array, reset_count: chex.Array) -> chex.PRNGKey:
@@ -53,7 +60,7 @@ def _start_keys(key: chex.PRNGKey, lane_id: chex.Array, reset_count: chex.Array)
 
 
 def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
-    """Put lanes whose episode is over at their next start.
+    """Put lanes whose episode is over at their next start, with a memory of zeros.
 
     Starts are drawn for all lanes at once, and only when some lane has used its own: drawn at every step they would
     cost many times the physics. A lane that has not gets the same start again.
@@ -78,13 +85,14 @@ def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
         next_state=next_state,
         reset_count=reset_count,
         next_state_used=used | lanes.done,
+        memory=jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory),
     )
 
 
 def unroll(
     env: TaskEnv,
     lanes: Lanes,
-    mean: Callable[[chex.Array], chex.Array],
+    policy: Callable[[Any, chex.Array], tuple[Any, chex.Array]],
     sigma: chex.Array,
     noise_key: chex.PRNGKey,
     start_key: chex.PRNGKey,
@@ -92,7 +100,8 @@ def unroll(
     unroll_length: int,
     max_episode_steps: int,
 ) -> tuple[Lanes, Transition]:
-    """T steps of every lane under mu = N(mean(observation), sigma²·I); transitions with leaves [N, T, ...].
+    """T steps of every lane under mu = N(mean, sigma²·I), where policy(memory, observation) gives the next memory and
+    the mean; transitions with leaves [N, T, ...].
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last step is
     `truncated` where it reached `max_episode_steps` or where the environment's `info` says so ("truncation",
@@ -103,7 +112,7 @@ def unroll(
     def step(lanes: Lanes, noise: chex.Array) -> tuple[Lanes, Transition]:
         lanes = restart(env, lanes, start_key)
         observation = lanes.state.obs
-        center = mean(observation)
+        memory, center = policy(lanes.memory, observation)
         action = center + sigma * noise
         state = jax.vmap(env.step)(lanes.state, jnp.clip(action, -1.0, 1.0))
         steps = lanes.steps + 1
@@ -123,11 +132,14 @@ def unroll(
             out_of_bounds=(ended & out_of_bounds).astype(jnp.float32),
         )
         num_early = lanes.num_early + (ended & (steps < max_episode_steps))
-        return lanes._replace(state=state, steps=steps, done=done, num_early=num_early), transition
+        after = lanes._replace(state=state, steps=steps, done=done, num_early=num_early, memory=memory)
+        return after, transition
 
     def unroll_block(lanes: Lanes) -> tuple[Lanes, Transition]:
+        # The first step's, which is anew in a lane that is about to restart.
+        memory = jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory)
         lanes, transitions = jax.lax.scan(step, lanes, jnp.swapaxes(noise(lanes.lane_id), 0, 1))
-        return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)
+        return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)._replace(memory=memory)
 
     return _in_blocks(unroll_block, lanes)
 

@@ -100,6 +100,7 @@ class Transition(NamedTuple):
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
     out_of_bounds: chex.Array  # [...] float 0 or 1: truncated where no transition of the environment begins
+    memory: Any = ()  # the policy's before the first step of an unroll, without a time axis: [..., H]; () for none
 
 
 class Networks(NamedTuple):

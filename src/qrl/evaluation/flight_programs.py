@@ -43,10 +43,14 @@ class FlightPrograms:
         """The member's learner in NumPy, with the policy that is deployed."""
         return jax.tree.map(lambda x: np.asarray(x[0], np.float64), learners.deployed(self._setup.spec, learner))
 
-    def policy_mean(self, learner: LearnerState, observation: chex.Array) -> chex.Array:
-        """Mean action of the deployed policy; [..., F] -> [..., A]."""
+    def initial_memory(self, *lanes: int) -> Any:
+        """The policy's memory at the start of a flight; [*lanes, H], or () of a feed-forward policy."""
+        return learners.initial_memory(self._setup.spec, *lanes)
+
+    def act(self, learner: LearnerState, memory: Any, observation: chex.Array) -> tuple[Any, chex.Array]:
+        """Next memory and mean action of the deployed policy; [..., F] -> [..., A]."""
         one = learners.deployed(self._setup.spec, jax.tree.map(lambda x: x[0], learner))
-        return learners.policy_mean(self._setup.spec, self.config.hyperparameters, one, observation)
+        return learners.act(self._setup.spec, self.config.hyperparameters, one, memory, observation)
 
     def compile(self, env: Env, starts: chex.PRNGKey, executor: Executor) -> None:
         """Start compiling `fly` in `executor`."""

@@ -133,9 +133,13 @@ class TrainedRun:
             lambda env, keys: jax.vmap(partial(reset, env))(in_envelope, keys),
         )
 
-    def policy_mean(self, observation: chex.Array) -> chex.Array:
-        """The deployed policy's mean action as a pure JAX function; [..., F] -> [..., A]."""
-        return self._programs.policy_mean(self._learner, observation)
+    def initial_memory(self, *lanes: int) -> Any:
+        """The policy's memory at the start of a flight; [*lanes, H], or () of a feed-forward policy."""
+        return self._programs.initial_memory(*lanes)
+
+    def act(self, memory: Any, observation: chex.Array) -> tuple[Any, chex.Array]:
+        """Next memory and mean action of the deployed policy as a pure JAX function; [..., F] -> [..., A]."""
+        return self._programs.act(self._learner, memory, observation)
 
     def policy(self, memory: Memory | None = None) -> Policy:
         """The policy to deploy, calibrated on observations of its own flights. BadInput without a control period.

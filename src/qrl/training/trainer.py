@@ -5,6 +5,7 @@ and compiles them.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import chex
@@ -61,7 +62,13 @@ def init_state(setup: Setup, seed: chex.Array, inputs: MemberInputs) -> TrainSta
     learner_key, start_key, key = jax.random.split(jax.random.PRNGKey(seed), 3)
     lane_ids = sharding.local_indices(setup.mesh, config.num_envs)
     lanes = rollout.init(
-        setup.env_of(inputs), start_key, lane_ids, config.num_envs, setup.max_episode_steps, config.unroll_length
+        setup.env_of(inputs),
+        start_key,
+        lane_ids,
+        config.num_envs,
+        setup.max_episode_steps,
+        config.unroll_length,
+        learner.initial_memory(setup.spec, len(lane_ids)),
     )
     first = learner.init(setup.spec, hyper, learner_key)
     _, transitions = jax.eval_shape(lambda *x: collect(setup, hyper, *x), first, lanes, key, start_key)
@@ -98,7 +105,7 @@ def collect(
     return rollout.unroll(
         setup.env,  # of any parameters: each lane carries its own
         lanes,
-        lambda observation: learner.policy_mean(spec, hyper, state, observation),
+        partial(learner.act, spec, hyper, state),
         learner.sigma(hyper, state),
         noise_key,
         start_key,
@@ -202,9 +209,9 @@ def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainS
 
     def returns_of(now: LearnerState) -> tuple[chex.Array, chex.Array]:
         noise = learner.sigma(inputs.hyper, now) * analytic_gradient.decay(step, updates)
-        mean = lambda observation: learner.policy_mean(spec, inputs.hyper, now, observation)  # noqa: E731
+        act, memory = partial(learner.act, spec, inputs.hyper, now), learner.initial_memory(spec, len(keys))
         return analytic_gradient.returns(
-            env, mean, noise, keys, config.apg_episode_length, inputs.hyper.apg_cotangent_norm
+            env, act, memory, noise, keys, config.apg_episode_length, inputs.hyper.apg_cotangent_norm
         )
 
     now, metrics, (rewards, complete), skipped = analytic_gradient.update(
@@ -235,11 +242,8 @@ def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainS
 def fly(setup: Setup, state: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
     """Flights of a member's deployed policy, one for each of `keys`."""
     spec, now = setup.spec, learner.deployed(setup.spec, state)
-
-    def mean(observation: chex.Array) -> chex.Array:
-        return learner.policy_mean(spec, inputs.hyper, now, observation)
-
-    return flights.fly(setup.env_of(inputs), mean, keys, setup.max_episode_steps)
+    act, memory = partial(learner.act, spec, inputs.hyper, now), learner.initial_memory(spec, len(keys))
+    return flights.fly_with_memory(setup.env_of(inputs), act, memory, keys, setup.max_episode_steps)
 
 
 class Trainer(NamedTuple):
