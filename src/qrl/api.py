@@ -43,7 +43,8 @@ THREADS = "PJRT_NPROC"  # XLA's number of threads, which a run with small produc
 class DeployedPolicy:
     """The deterministic policy of a run.
 
-    Called, it is NumPy in SI units: observations [..., F] -> actions [..., A]. `apply` is a pure function in JAX with
+    Called, it is NumPy in SI units: observations [..., F] -> actions [..., A]; of a recurrent policy, with a memory of
+    zeros. `apply` is a pure function in JAX with
     explicit memory, to be jitted, vmapped or differentiated; its actions are in [−1, 1], as environments take them.
     """
 
@@ -52,7 +53,9 @@ class DeployedPolicy:
         self._run = run
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float64]:
-        return self._numpy(inputs_in_si(self._numpy, np.asarray(observation)))
+        inputs = inputs_in_si(self._numpy, np.asarray(observation))
+        units = self._numpy.memory.units if self._numpy.memory else 0
+        return self._numpy(np.concatenate([inputs, np.zeros((*inputs.shape[:-1], units))], axis=-1))
 
     def init_memory(self, *lanes: int) -> Any:
         """Memory at the start of so many flights, [*lanes, H]; () of a feed-forward policy."""

@@ -87,8 +87,8 @@ def returns(
         reward = jnp.where(alive > 0, after.reward, charge)
         changing = jax.tree.map(lambda new, old: jnp.where(alive > 0, new, old), changing_of(after), changing)
         if cotangent_norm is not None:
-            physical, memory = _bounded((changing.pipeline_state, memory), cotangent_norm)
-            changing = changing.replace(pipeline_state=physical)
+            # The observation too: through it alone the next action depends on this one.
+            changing, memory = _bounded((changing, memory), cotangent_norm)
         return (changing, memory, alive * (1.0 - after.done)), reward
 
     # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.

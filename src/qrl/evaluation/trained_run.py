@@ -23,7 +23,7 @@ from qrl.algorithm.types import Env, State
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import calibration_starts
-from qrl.export.policy import ActionSpec, BodyFrame, Integral, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import ActionSpec, BodyFrame, GatedUnit, Integral, Layer, Memory, ObservationSpec, Policy, Provenance
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
@@ -149,11 +149,14 @@ class TrainedRun:
         policy = self.float_policy(memory)
 
         def step(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[NDArray[np.integer], Any]:
-            return memory, policy(inputs_in_si(policy, observation))  # the environment keeps the memory
+            # The environment keeps the rest of the memory; the numbers of a recurrent unit travel as their bits.
+            inputs = np.concatenate([inputs_in_si(policy, observation), memory.view(np.float32)], axis=-1)
+            h, action = policy.respond(inputs)
+            return np.ascontiguousarray(h, np.float32).view(np.int32), action
 
         starts = calibration_starts(calibration.STARTS)
-        none = np.zeros((len(starts), 0), np.int32)
-        flown = self.fly_host_policy(step, none, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
+        first = np.zeros((len(starts), self.config.learner.policy_gru_size or 0), np.int32)
+        flown = self.fly_host_policy(step, first, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
         return replace(policy, calibration=calibration.select(flown_inputs(policy, flown)))
 
     def float_policy(self, memory: Memory | None = None) -> Policy:
@@ -163,14 +166,14 @@ class TrainedRun:
         says in its order: the previous action a [A] in [−1, 1], the integral [k] in m·s; then what the policy does not
         see, if anything.
         """
-        memory = memory or self._memory()
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
-        layers = deployed.params.policy["params"]
+        memory = memory or self._memory(config.policy_gru_size or 0)
+        layers, unit = _layers(deployed.params.policy["params"], recurrent=bool(config.policy_gru_size))
         view = getattr(self.env, "body_view", None)
         body_frame = BodyFrame(*view) if view else None
         normalize = config.normalize_observations
         observations, actions = self._specs()
-        size = len(layers["Dense_0"]["kernel"])  # of what the policy sees
+        size = len(layers[0][0])  # of what the policy sees
         if body_frame:
             size = body_frame.measured + (memory.size(len(actions)) if memory else 0)
         mean = np.asarray(deployed.statistics.mean)[:size] if normalize else np.zeros(size)
@@ -193,11 +196,12 @@ class TrainedRun:
             observation_gain=gain / scale_si,
             observation_clip=MAX_NORMALIZED if normalize else np.inf,
             observation_scale=np.asarray(config.observation_scale or np.ones(size))[:size],
-            layers=tuple((layers[f"Dense_{i}"]["kernel"], layers[f"Dense_{i}"]["bias"]) for i in range(len(layers))),
+            layers=layers,
             activation=config.activation,
-            calibration=np.zeros((0, size), np.float32),
+            calibration=np.zeros((0, size + (memory.units if memory else 0)), np.float32),
             memory=memory,
             body_frame=body_frame,
+            unit=unit,
         )
 
     def tail_steps(self) -> int:
@@ -206,12 +210,13 @@ class TrainedRun:
             return self.max_episode_steps // 4
         return round(self.task.evaluation.tail_s / self.task.control_period_s)
 
-    def _memory(self) -> Memory | None:
-        """The memory that the task gives its policy."""
+    def _memory(self, units: int) -> Memory | None:
+        """The memory that the task gives its policy, and that of a recurrent one."""
         if not isinstance(self.task, QuadrotorTask) or self.task.memory == task_spec.Memory():
-            return None
+            return Memory(previous_action=False, integral=None, units=units) if units else None
         integral = integrator(self.task)
         return Memory(
+            units=units,
             previous_action=self.task.memory.previous_action,
             integral=integral
             and Integral(
@@ -238,6 +243,25 @@ class TrainedRun:
             tuple(ObservationSpec(f"o{i}", "?", frame) for i in range(sizes[0])),
             tuple(replace(action, name=f"a{i}") for i in range(sizes[1])),
         )
+
+
+def _layers(params: dict[str, Any], recurrent: bool) -> tuple[tuple[Layer, ...], GatedUnit | None]:
+    """The layers of a policy network's parameters, and its recurrent unit."""
+
+    def layer(name: str) -> Layer:
+        return params[name]["kernel"], params[name]["bias"]
+
+    if not recurrent:
+        return tuple(layer(f"Dense_{i}") for i in range(len(params))), None
+    hidden = tuple(layer(f"layers_{i}") for i in range(sum(name.startswith("layers_") for name in params)))
+    (weight, bias), own, candidate = layer("of_input"), params["of_memory"]["kernel"], params["candidate_bias"]
+    both = 2 * len(own)
+    unit = GatedUnit(
+        gates=(np.concatenate([weight[:, :both], own[:, :both]]), bias[:both]),
+        of_input=(weight[:, both:], bias[both:]),
+        of_memory=(own[:, both:], candidate),
+    )
+    return (*hidden, layer("of_output")), unit
 
 
 def vehicle_name(task: Task | None) -> str | None:
@@ -271,7 +295,13 @@ def flown_inputs(policy: Policy, flights: Flights) -> NDArray[np.float32]:
         for observation in measured.swapaxes(0, 1):
             totals.append(policy.integrated(totals[-1], observation))
         parts.append(np.stack(totals[1:], axis=1))
-    return np.concatenate(parts, axis=-1).astype(np.float32)
+    inputs = np.concatenate(parts, axis=-1).astype(np.float32)
+    if policy.unit is None:
+        return inputs
+    remembered = [np.zeros((len(inputs), policy.memory.units if policy.memory else 0))]
+    for now in inputs.swapaxes(0, 1):
+        remembered.append(policy.respond(np.concatenate([now, remembered[-1]], axis=-1))[0])
+    return np.concatenate([inputs, np.stack(remembered[:-1], axis=1)], axis=-1).astype(np.float32)
 
 
 def _units(actions: tuple[ActionSpec, ...], size: int, memory: Memory | None) -> tuple[Any, Any]:

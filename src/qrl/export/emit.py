@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,9 +58,9 @@ def state_bytes(kernel: Kernel) -> int:
     """sizeof(NAME_state)."""
     if kernel.memory is None:
         return 1
-    action = 0 if kernel.memory.initial_action is None else 2 * len(kernel.memory.initial_action)
+    short = 2 * (kernel.memory.actions + kernel.memory.units)
     integral = 4 * kernel.memory.integral.size if kernel.memory.integral else 0
-    return -(-(integral + action) // 4) * 4 if integral else action
+    return -(-(integral + short) // 4) * 4 if integral else short
 
 
 def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
@@ -100,10 +100,12 @@ def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
 
 
 def _memory(policy: Policy, kernel: Kernel) -> dict[str, Any] | None:
-    """What the state holds: the previous action and the integral of the error, each null if it does not."""
+    """What the state holds: the previous action, the integral of the error and a recurrent network's numbers, each null
+    if it does not.
+    """
     if policy.memory is None or kernel.memory is None:
         return None
-    found: dict[str, Any] = {"previous_action": None, "integral": None}
+    found: dict[str, Any] = {"previous_action": None, "integral": None, "recurrent": None}
     if kernel.memory.initial_action is not None:
         first = (kernel.memory.initial_action * kernel.act_lsb.astype(np.float64)).tolist()
         found["previous_action"] = {"after_reset": first}
@@ -116,6 +118,8 @@ def _memory(policy: Policy, kernel: Kernel) -> dict[str, Any] | None:
             "limit_m_s": policy.memory.integral.limit_m_s,
             "lsb": kernel.memory.integral.unit_m_s,
         }
+    if units := kernel.memory.units:
+        found["recurrent"] = {"cell": "gru", "units": units, "lsb": 1.0 / reference.INT16}
     return found
 
 
@@ -150,6 +154,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "seen": str(len(reference.measured(kernel, kernel.obs_max[None])[0])),
         "turn": str(int(kernel.turn is not None)),
         "kept": str(len(kernel.memory.shift) if kernel.memory else 0),
+        "units": str(kernel.memory.units if kernel.memory else 0),
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(run.task),
         "ports": "\n".join(f" * {_comment_safe(line)}".rstrip() for line in _port_lines(policy, kernel)),
@@ -171,7 +176,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
-        "widest": str(max(map(_padded, (len(kernel.scale), *kernel.widths)))),
+        "widest": str(max(_padded(len(kernel.scale)), *(size for layer in _layers(kernel) for size in layer.shape))),
         "tanh": str(int(kernel.activation == "tanh")),
         "tables": _tables(kernel, golden, name.upper()),
     }
@@ -193,6 +198,9 @@ def _state(kernel: Kernel) -> tuple[str, str]:
     if (first := kernel.memory.initial_action) is not None:
         fields.append(f"    int16_t previous_action[{len(first)}]; /* in steps of lsb */")
         words.append("the previous action")
+    if units := kernel.memory.units:
+        fields.append(f"    int16_t recurrent[{units}]; /* of the network's recurrent unit, in 1 / 32767 */")
+        words.append("the numbers of the network's recurrent unit")
     return "\n".join(fields), " and ".join(words)
 
 
@@ -224,34 +232,62 @@ def _padded(n: int) -> int:
     return -(-n // 4) * 4
 
 
+class _Layer(NamedTuple):
+    """A layer as the C has it: weights [outputs, inputs], both padded to multiples of four."""
+
+    dense: Dense
+    weight: Ints
+    hidden: bool
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.weight.shape[0], self.weight.shape[1]
+
+
+def _layers(kernel: Kernel) -> list[_Layer]:
+    found = []
+    for dense in kernel.products:
+        parts = [dense.weight]
+        if kernel.unit and dense is kernel.unit.gates:  # each of its two inputs is padded
+            parts = np.split(dense.weight, [dense.weight.shape[1] - kernel.unit.units], axis=1)
+        weight = np.concatenate([np.pad(x, ((0, 0), (0, -x.shape[1] % 4))) for x in parts], axis=1)
+        weight = np.pad(weight, ((0, -len(weight) % 4), (0, 0)))
+        found.append(_Layer(dense, weight, hidden=any(dense is layer for layer in kernel.layers[:-1])))
+    return found
+
+
 def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
-    sizes = list(map(_padded, kernel.widths))
+    layers = _layers(kernel)
     columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max
     inputs = (f"{{{s}u, {e}, {low}, {high}}}" for s, e, low, high in zip(*columns, strict=True))
     parts = [
-        f"#define LAYERS {len(kernel.layers)}\n#define PADDED_INPUTS {sizes[0]}\n#define GOLDENS {embedded(kernel)}",
+        f"#define LAYERS {len(layers)}\n#define PADDED_INPUTS {layers[0].shape[1]}\n#define GOLDENS {embedded(kernel)}",
         _array(f"struct input inputs[{prefix}_OBS_SIZE]", inputs, 6),
         _array(f"float act_lsb[{prefix}_ACT_SIZE]", map(_float, kernel.act_lsb), 4),
         _array(f"float act_safe[{prefix}_ACT_SIZE]", map(_float, kernel.act_safe), 4),
         _array(f"int16_t act_least[{prefix}_ACT_SIZE]", kernel.act_min, 12),
         _array(f"int16_t act_most[{prefix}_ACT_SIZE]", kernel.act_max, 12),
     ]
-    if kernel.activation == "tanh":
+    if kernel.activation == "tanh" or kernel.unit:
         parts.append(_array("int16_t tanh_table[257]", reference.tanh_table(), 16))
     if memory := kernel.memory:
         parts += _memory_tables(memory, prefix)
         if memory.integral:
             parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
+    if units := kernel.memory.units if kernel.memory else 0:
+        parts.append(f"#define UNIT_LAYER {len(kernel.layers) - 1}\n#define UNIT_INPUTS {_padded(kernel.widths[-3])}")
+        last = np.ascontiguousarray(golden.outputs.state[embedded(kernel) - 1, -2 * units :]).view("<i2")
+        parts.append(_array("int16_t golden_recurrent[UNITS]", last, 12))
     if turn := kernel.turn:
         shifts = {"UP": turn.up, "POSITION": turn.position, "VELOCITY": turn.velocity, "AHEAD": turn.ahead}
         numbers = {"HEADING": int(turn.heading), "VECTORS": turn.vectors, "LAST": turn.last}
         numbers |= {f"{name}_SHIFT": shift for name, shift in shifts.items()}
         parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
-    parts += [_layer_tables(i, layer) for i, layer in enumerate(kernel.layers)]
+    parts += [_layer_tables(i, layer) for i, layer in enumerate(layers)]
     rows = (
-        f"{{weights_{i}.w, biases_{i}, factors_{i}, {sizes[i]}, {sizes[i + 1]},"
-        f" {int(i < len(kernel.layers) - 1)}, {layer.shift}}}"
-        for i, layer in enumerate(kernel.layers)
+        f"{{weights_{i}.w, biases_{i}, factors_{i}, {layer.shape[1]}, {layer.shape[0]},"
+        f" {int(layer.hidden)}, {layer.dense.shift}}}"
+        for i, layer in enumerate(layers)
     )
     parts.append(_array("struct layer layers[LAYERS]", rows, 1))
     parts.append(_array("struct golden goldens[GOLDENS]", _golden_rows(golden, embedded(kernel)), 1))
@@ -260,7 +296,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
 
 def _memory_tables(memory: Memory, prefix: str) -> list[str]:
     kept = (f"{{{s}, {low}, {high}}}" for s, low, high in zip(memory.shift, memory.low, memory.high, strict=True))
-    parts = [_array("struct kept kept[KEPT]", kept, 8)]
+    parts = [_array("struct kept kept[KEPT]", kept, 8)] if len(memory.shift) else []
     if memory.initial_action is not None:
         parts.append(_array(f"int16_t act_first[{prefix}_ACT_SIZE]", memory.initial_action, 12))
     return parts
@@ -285,12 +321,11 @@ def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, golde
     ]
 
 
-def _layer_tables(index: int, layer: Dense) -> str:
-    outputs, inputs = layer.weight.shape
-    weight = np.pad(layer.weight, ((0, _padded(outputs) - outputs), (0, _padded(inputs) - inputs)))
+def _layer_tables(index: int, layer: _Layer) -> str:
+    weight, outputs = layer.weight, len(layer.dense.bias)
     tiles = weight.reshape(len(weight) // 4, 4, -1, 4).swapaxes(1, 2).reshape(-1, 4)
     fours = (f"W4({', '.join(map(str, four))})" for four in tiles)
-    bias, multiplier = (np.pad(x, (0, len(weight) - outputs)) for x in (layer.bias, layer.multiplier))
+    bias, multiplier = (np.pad(x, (0, len(weight) - outputs)) for x in (layer.dense.bias, layer.dense.multiplier))
     sums = weight.sum(axis=1)
     return "\n".join(
         [

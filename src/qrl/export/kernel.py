@@ -61,7 +61,8 @@ class Integral:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """The network's inputs [M] after the observation, from the state: the previous action, then the integral.
+    """The network's inputs [M] after the observation, from the state: the previous action, then the integral. After
+    these the state has the numbers [H] of a recurrent network.
 
     An input is ⌊value / 2^shift⌉ of the state's integer, saturated at low and high.
     """
@@ -71,6 +72,30 @@ class Memory:
     shift: Ints  # [M] in [0, 30]
     low: Ints  # [M]
     high: Ints  # [M]
+    units: int = 0  # H
+
+    @property
+    def actions(self) -> int:
+        """How many numbers of the state are a previous action."""
+        return 0 if self.initial_action is None else len(self.initial_action)
+
+
+@dataclass(frozen=True, eq=False)
+class GatedUnit:
+    """A gated recurrent unit (`policy.GatedUnit`) of inputs x and h, in 1/32767.
+
+    r and z are (table + 32768) >> 1 of the tanh of half of what they are given, n the tanh of of_input + ⌊r·of_memory /
+    2¹⁵⌉, saturated; the next h is n + ⌊(h − n)·z / 2¹⁵⌉.
+    """
+
+    gates: Dense  # of x and h
+    of_input: Dense
+    of_memory: Dense
+
+    @property
+    def units(self) -> int:
+        """H."""
+        return len(self.of_memory.bias)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +135,7 @@ class Kernel:
     obs_shift: Ints  # [F] in [0, 15]; 0 but for a position that is integrated
     memory: Memory | None = None
     turn: Turn | None = None  # None: the network is given the observation as it is
+    unit: GatedUnit | None = None  # before the last layer
 
     @property
     def lsb(self) -> NDArray[np.float64]:
@@ -119,9 +145,11 @@ class Kernel:
     @property
     def memory_steps(self) -> NDArray[np.float64]:
         """The step of each of the memory's inputs, in N or m·s; [M]."""
+        parts = [np.zeros(0)]
         if self.memory is None:
-            return np.zeros(0)
-        parts = [] if self.memory.initial_action is None else [self.act_lsb.astype(np.float64)]
+            return parts[0]
+        if self.memory.initial_action is not None:
+            parts.append(self.act_lsb.astype(np.float64))
         if self.memory.integral:
             parts.append(np.full(self.memory.integral.size, self.memory.integral.unit_m_s))
         return np.concatenate(parts) * 2.0**self.memory.shift
@@ -145,8 +173,15 @@ class Kernel:
 
     @property
     def widths(self) -> list[int]:
-        """Numbers of the network's inputs, of each hidden layer's units and of actions."""
-        return [self.layers[0].weight.shape[1], *(len(layer.bias) for layer in self.layers)]
+        """Numbers of the network's inputs, of each hidden layer's units, a recurrent one's too, and of actions."""
+        hidden = [len(layer.bias) for layer in self.layers[:-1]] + ([self.unit.units] if self.unit else [])
+        return [self.layers[0].weight.shape[1], *hidden, len(self.layers[-1].bias)]
+
+    @property
+    def products(self) -> list[Dense]:
+        """All layers in their order; a recurrent one is three."""
+        unit = [self.unit.gates, self.unit.of_input, self.unit.of_memory] if self.unit else []
+        return [*self.layers[:-1], *unit, self.layers[-1]]
 
 
 class AccumulatorOverflow(ArithmeticError):
@@ -158,12 +193,24 @@ def accumulator_bound(kernel: Kernel) -> int:
     _check_fields(kernel)
     low, high = kernel.input_limits
     largest, size = 0, np.maximum(np.abs(low), np.abs(high))
-    for i, layer in enumerate(kernel.layers):
+
+    def bound(name: str, layer: Dense, size: Ints) -> None:
+        nonlocal largest
         bounds = np.abs(layer.weight) @ size + np.abs(layer.bias)
         row = int(np.argmax(bounds))
         if bounds[row] >= 2**31:
-            raise AccumulatorOverflow(f"layer {i}, output {row}: the accumulator can reach {bounds[row]:,} > 2^31")
-        largest, size = max(largest, int(bounds[row])), np.full(len(layer.bias), INT16 + 1)
+            raise AccumulatorOverflow(f"{name}, output {row}: the accumulator can reach {bounds[row]:,} > 2^31")
+        largest = max(largest, int(bounds[row]))
+
+    for i, layer in enumerate(kernel.layers):
+        if kernel.unit and i == len(kernel.layers) - 1:
+            h = np.full(kernel.unit.units, INT16 + 1)
+            bound("gates", kernel.unit.gates, np.concatenate([size, h]))
+            bound("candidate of the input", kernel.unit.of_input, size)
+            bound("candidate of the memory", kernel.unit.of_memory, h)
+            size = h
+        bound(f"layer {i}", layer, size)
+        size = np.full(len(layer.bias), INT16 + 1)
     return largest
 
 
@@ -201,7 +248,7 @@ def _check_fields(kernel: Kernel) -> None:
                     ("the circle's radius", circle.factor, 2**14, INT16),
                     ("the circle's radius", circle.shift, 1, 30),
                 ]
-    for layer in kernel.layers:
+    for layer in kernel.products:
         ranges += [
             ("a weight", layer.weight, -127, 127),
             ("a bias", layer.bias, -(2**31) + 1, 2**31 - 1),
@@ -243,11 +290,25 @@ def hidden(layer: Dense, activation: str, x: Ints) -> Ints:
     return dense(layer, x, 0) if activation == "relu" else _tanh(dense(layer, x, -INT16 - 1))
 
 
-def network(kernel: Kernel, x: Ints) -> Ints:
-    """Actions [n, A], in steps of act_lsb, for the network's inputs x."""
+def network(kernel: Kernel, x: Ints, h: Ints | None = None) -> tuple[Ints, Ints]:
+    """Next h [n, H], of a feed-forward network [n, 0], and actions [n, A] in steps of act_lsb, for the network's inputs
+    x and h.
+    """
+    h = np.zeros((len(x), 0), np.int64) if h is None else h
     for layer in kernel.layers[:-1]:
         x = hidden(layer, kernel.activation, x)
-    return np.clip(dense(kernel.layers[-1], x, -INT16 - 1), kernel.act_min, kernel.act_max)
+    if kernel.unit:
+        x = h = remember(kernel.unit, x, h)
+    return h, np.clip(dense(kernel.layers[-1], x, -INT16 - 1), kernel.act_min, kernel.act_max)
+
+
+def remember(unit: GatedUnit, x: Ints, h: Ints) -> Ints:
+    """The next h [n, H] for inputs x [n, D] and h."""
+    low = -INT16 - 1
+    r, z = np.split(_tanh(dense(unit.gates, np.concatenate([x, h], axis=-1), low)) + INT16 + 1 >> 1, 2, axis=-1)
+    given = dense(unit.of_input, x, low) + shifted(r * dense(unit.of_memory, h, low), 15)
+    n = _tanh(np.clip(given, low, INT16))
+    return n + shifted((h - n) * z, 15)
 
 
 def _tanh(z: Ints) -> Ints:
@@ -261,7 +322,8 @@ def shifted(x: Ints, shift: Ints | int) -> Ints:
 
 
 def initial_state(kernel: Kernel, n: int) -> Ints:
-    """State [n, S] after a reset: the previous action [A], if it is an input, then the integral [k], if there is one.
+    """State [n, S] after a reset: the previous action [A], if it is an input, then the integral [k], if there is one,
+    then h [H] of a recurrent policy.
 
     A policy without memory has no columns.
     """
@@ -269,7 +331,7 @@ def initial_state(kernel: Kernel, n: int) -> Ints:
         return np.zeros((n, 0), np.int64)
     first, integral = kernel.memory.initial_action, kernel.memory.integral
     axes = integral.size if integral else 0
-    parts = [np.zeros(0, np.int64) if first is None else first, np.zeros(axes, np.int64)]
+    parts = [np.zeros(0, np.int64) if first is None else first, np.zeros(axes + kernel.memory.units, np.int64)]
     return np.tile(np.concatenate(parts), (n, 1))
 
 
@@ -312,7 +374,8 @@ def inputs(kernel: Kernel, state: Ints, x: Ints) -> Ints:
     first = measured(kernel, x)
     if kernel.memory is None:
         return first
-    kept = np.clip(shifted(state, kernel.memory.shift), kernel.memory.low, kernel.memory.high)
+    kept = state[:, : len(kernel.memory.shift)]
+    kept = np.clip(shifted(kept, kernel.memory.shift), kernel.memory.low, kernel.memory.high)
     return np.concatenate([first, remembered(kernel, kept, x)], axis=-1)
 
 
@@ -327,14 +390,13 @@ def remembered(kernel: Kernel, kept: Ints, x: Ints) -> Ints:
 
 def _act(kernel: Kernel, state: Ints, x: Ints) -> tuple[Ints, Ints]:
     """Next state and action [n, A] in steps of act_lsb, for saturated observations x [n, F]."""
-    if kernel.memory and (integral := kernel.memory.integral):
-        axes = integral.size
-        total = integrated(integral, state[:, -axes:], x[:, list(integral.position)])
-        state = np.concatenate([state[:, :-axes], total], axis=-1)
-    action = network(kernel, inputs(kernel, state, x))
-    if kernel.memory and kernel.memory.initial_action is not None:
-        state = np.concatenate([action, state[:, action.shape[-1] :]], axis=-1)
-    return state, action
+    if (memory := kernel.memory) is None:
+        return state, network(kernel, inputs(kernel, state, x))[1]
+    previous, total, h = np.split(state, [memory.actions, len(memory.shift)], axis=-1)
+    if memory.integral:
+        total = integrated(memory.integral, total, x[:, list(memory.integral.position)])
+    h, action = network(kernel, inputs(kernel, np.concatenate([previous, total], axis=-1), x), h)
+    return np.concatenate([action[:, : memory.actions], total, h], axis=-1), action
 
 
 def step_i16(kernel: Kernel, state: Ints, observation: NDArray[np.int16]) -> tuple[Ints, Ints, NDArray[np.int16]]:

@@ -86,13 +86,15 @@ class Integral:
 
 @dataclass(frozen=True)
 class Memory:
-    """Inputs of the network that are not measured, after the observation: the previous action, then the integral.
+    """Inputs of the network that are not measured, after the observation: the previous action, then the integral. And
+    what a recurrent network remembers.
 
     The previous action [A] is in SI units as it was output; after a reset, the action for a = 0.
     """
 
     previous_action: bool
     integral: Integral | None
+    units: int = 0  # H of the gated recurrent unit; 0: none
 
     def size(self, actions: int) -> int:
         """Number of these inputs."""
@@ -151,39 +153,74 @@ Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outpu
 
 
 @dataclass(frozen=True, eq=False)
+class GatedUnit:
+    """A gated recurrent unit of D inputs x and H numbers h: r, z = σ(x W + h U + b), n = tanh(x W_n + b_n + r·(h U_n +
+    c)), next h = z·h + (1 − z)·n (Cho et al. 2014, in cuDNN's form).
+    """
+
+    gates: Layer  # [D + H, 2H], [2H]: W over U, and b; r, then z
+    of_input: Layer  # [D, H], [H]: W_n and b_n
+    of_memory: Layer  # [H, H], [H]: U_n and c
+
+    def sums(self, x: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """What gates [..., 2H] and candidate, of the input and of the memory [..., H] each, are given."""
+        terms = zip((self.gates, self.of_input, self.of_memory), (np.concatenate([x, h], axis=-1), x, h), strict=True)
+        return tuple(given @ weight + bias for (weight, bias), given in terms)
+
+    def __call__(self, x: NDArray[np.float64], h: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The next h; [..., D], [..., H] -> [..., H]."""
+        gates, of_input, of_memory = self.sums(x, h)
+        r, z = np.split(sigmoid(gates), 2, axis=-1)
+        return z * h + (1.0 - z) * np.tanh(of_input + r * of_memory)
+
+
+def sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 0.5 + 0.5 * np.tanh(0.5 * x)
+
+
+@dataclass(frozen=True, eq=False)
 class Policy:
     """Deterministic policy in SI units: inputs [..., I] -> action [..., A].
 
-    The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds [M]; I = F + M. With a
-    `body_frame` the network is given them in it.
+    The inputs are the measured observation [F] and, of a policy with memory, what `Memory` adds: I_0 in all, of which
+    the network is given scaled ones, with a `body_frame` in that. Of a recurrent policy then its h [H], from 0 after a
+    reset on: I = I_0 + H.
     """
 
     provenance: Provenance
     control_period_s: float
     observations: tuple[ObservationSpec, ...]
     actions: tuple[ActionSpec, ...]
-    observation_offset: NDArray[np.float64]  # [I] the network's input is clip((o − offset)·gain, ±clip)·scale
-    observation_gain: NDArray[np.float64]  # [I]
+    observation_offset: NDArray[np.float64]  # [I_0] the network's input is clip((o − offset)·gain, ±clip)·scale
+    observation_gain: NDArray[np.float64]  # [I_0]
     observation_clip: float  # infinite without clipping
-    observation_scale: NDArray[np.float64]  # [I]
+    observation_scale: NDArray[np.float64]  # [I_0]
     layers: tuple[Layer, ...]
     activation: str  # of all layers but the last: "relu" or "tanh"
     calibration: NDArray[np.float32]  # [n, I] inputs of the policy's own flights
     memory: Memory | None = None
     body_frame: BodyFrame | None = None
+    unit: GatedUnit | None = None  # before the last layer
 
     def __call__(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
         """Action in SI units; [..., I] -> [..., A]. Of a policy without memory the inputs are the observation."""
-        x = (inputs - self.observation_offset) * self.observation_gain
+        return self.respond(inputs)[1]
+
+    def respond(self, inputs: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The next h [..., H], of a feed-forward policy [..., 0], and the action [..., A] in SI units; of [..., I]."""
+        x, h = np.split(np.asarray(inputs, np.float64), [len(self.observation_scale)], axis=-1)
+        x = (x - self.observation_offset) * self.observation_gain
         x = np.clip(x, -self.observation_clip, self.observation_clip) * self.observation_scale
         x = self.seen(x)
         for weight, bias in self.layers[:-1]:
             x = ACTIVATIONS[self.activation](x @ weight + bias)
+        if self.unit:
+            x = h = self.unit(x, h)
         weight, bias = self.layers[-1]
-        return self.to_si(x @ weight + bias)
+        return h, self.to_si(x @ weight + bias)
 
     def seen(self, inputs: NDArray[np.floating]) -> NDArray[np.float64]:
-        """What the network is given of inputs [..., I], scaled or not."""
+        """What the network is given of inputs [..., I_0], scaled or not."""
         return self.body_frame(inputs) if self.body_frame else np.asarray(inputs, np.float64)
 
     @property
@@ -194,11 +231,11 @@ class Policy:
 
     @property
     def memory_size(self) -> int:
-        """M."""
-        return self.memory.size(len(self.actions)) if self.memory else 0
+        """Numbers of the memory: those among the inputs, and H."""
+        return self.memory.size(len(self.actions)) + self.memory.units if self.memory else 0
 
     def initial_memory(self, n: int) -> NDArray[np.float64]:
-        """Memory [n, M] after a reset, in the order of the inputs and in SI units."""
+        """Memory [n, memory_size] after a reset, in the order of the inputs and in SI units."""
         memory = np.zeros((n, self.memory_size))
         if self.memory and self.memory.previous_action:
             memory[:, : len(self.actions)] = self.to_si(np.zeros(len(self.actions)))
@@ -207,19 +244,20 @@ class Policy:
     def step(
         self, memory: NDArray[np.float64], observation: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Next memory [n, M] and action [n, A] for measured observations [n, F].
+        """Next memory [n, memory_size] and action [n, A] for measured observations [n, F].
 
         Where an observation is not finite, the safe action, and the memory as it was.
         """
         observation = np.asarray(observation, np.float64)
         finite = np.isfinite(observation).all(axis=-1, keepdims=True)
         observation, before = np.where(finite, observation, 0.0), memory
+        first = len(self.actions) if self.memory and self.memory.previous_action else 0
+        last = self.memory_size - (self.memory.units if self.memory else 0)
+        previous, total, h = np.split(memory, [first, last], axis=-1)
         if self.memory and self.memory.integral:
-            axes = self.memory.integral.size
-            memory = np.concatenate([memory[:, :-axes], self.integrated(memory[:, -axes:], observation)], axis=-1)
-        action = self(np.concatenate([observation, memory], axis=-1))
-        if self.memory and self.memory.previous_action:
-            memory = np.concatenate([action, memory[:, action.shape[-1] :]], axis=-1)
+            total = self.integrated(total, observation)
+        h, action = self.respond(np.concatenate([observation, previous, total, h], axis=-1))
+        memory = np.concatenate([action[:, :first], total, h], axis=-1)
         safe = np.array([port.safe for port in self.actions])
         return np.where(finite, memory, before), np.where(finite, action, safe)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
-from qrl.export.policy import ACTIVATIONS, BodyFrame, Layer, Policy
+from qrl.export.policy import ACTIVATIONS, BodyFrame, GatedUnit, Layer, Policy, sigmoid
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,8 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     layers = si_layers(policy)
     clip = policy.observation_clip / policy.observation_gain
     floor, ceiling = policy.observation_offset - clip, policy.observation_offset + clip
-    inputs = np.clip(policy.calibration.astype(np.float64), floor, ceiling)
+    inputs, h = np.split(policy.calibration.astype(np.float64), [len(floor)], axis=-1)
+    inputs = np.clip(inputs, floor, ceiling)
     x_float = policy.seen(inputs)
     measured = len(policy.observations)
     low, high = policy.limits
@@ -102,17 +103,21 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
 
     subset = slice(None, None, max(1, len(x_float) // FIT_SAMPLES))
     activation_ranges = _activation_ranges(layers, policy.activation, x_float)
-    x_float = x_float[subset]
-    sensitivity = _sensitivity(policy, layers, x_float)
+    x_float, h = x_float[subset], h[subset]
+    sensitivity, of_unit = _sensitivity(policy, layers, x_float, h)
     x = np.clip(np.round(x_float / step), *kernel.input_limits).astype(np.int64)
     dense: list[Dense] = []
     for i, (weight, bias) in enumerate(layers):
-        target = x_float @ weight + bias
         last = i == len(layers) - 1
+        if last and policy.unit:
+            unit, x = _gated_unit(policy.unit, x_float, h, x, step, of_unit, ridge)
+            kernel = replace(kernel, unit=unit)
+            x_float, step = policy.unit(x_float, h), np.full(unit.units, 1.0 / INT16)
+        target = x_float @ weight + bias
         if last:
             out = act_lsb.astype(np.float64)
         elif policy.activation == "relu":
-            out = _steps(activation_ranges[i], layers[i + 1][0], MIN_LEVELS)
+            out = _steps(activation_ranges[i], _following(policy, layers, i), MIN_LEVELS)
         else:
             out = np.full(len(bias), TANH_RANGE / (INT16 + 1))
         dense.append(_dense(weight * step[:, None], target, x, sensitivity[i], out, ridge))
@@ -125,6 +130,37 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     kernel = replace(kernel, layers=tuple(dense))
     accumulator_bound(kernel)
     return kernel
+
+
+def _following(policy: Policy, layers: list[Layer], i: int) -> Floats:
+    """The weights [outputs of hidden layer i, n] of what comes after it."""
+    if policy.unit and i == len(layers) - 2:
+        return np.concatenate([policy.unit.gates[0][: len(layers[i][1])], policy.unit.of_input[0]], axis=1)
+    return layers[i + 1][0]
+
+
+def _gated_unit(
+    unit: GatedUnit, x_float: Floats, h_float: Floats, x: Ints, step: Floats, sensitivity: list[Floats], ridge: float
+) -> tuple[integers.GatedUnit, Ints]:
+    """The recurrent unit in integers, and its next h [n, H]; for its inputs in float, and x [n, D] in `step`."""
+    h = np.round(h_float * INT16).astype(np.int64)
+    of_h = np.full(h.shape[1], 1.0 / INT16)
+    steps, given = (np.concatenate([step, of_h]), step, of_h), (np.concatenate([x, h], axis=1), x, h)
+    tanh_step = TANH_RANGE / (INT16 + 1)
+    found = [
+        _dense(weight * lsb[:, None], target, q, slope, np.full(len(bias), factor * tanh_step), ridge)
+        for (weight, bias), target, lsb, q, slope, factor in zip(
+            (unit.gates, unit.of_input, unit.of_memory),
+            unit.sums(x_float, h_float),
+            steps,
+            given,
+            sensitivity,
+            (2.0, 1.0, 1.0),  # a gate is a tanh of half of its sum
+            strict=True,
+        )
+    ]
+    made = integers.GatedUnit(*found)
+    return made, integers.remember(made, x, h)
 
 
 def _input_steps(
@@ -189,11 +225,13 @@ def respond(kernel: Kernel, x: NDArray[np.floating]) -> NDArray[np.float32]:
     unclipped, _ = integers.quantized(kernel, x[:, :measured].astype(np.float32))
     saturated = np.clip(unclipped, kernel.obs_min, kernel.obs_max)
     q = integers.measured(kernel, saturated)
+    h = None
     if kernel.memory:
-        kept = np.round(x[:, measured:] / kernel.memory_steps)
+        kept, h = np.split(x[:, measured:], [len(kernel.memory.shift)], axis=-1)
+        kept, h = np.round(kept / kernel.memory_steps), np.round(h * INT16).astype(np.int64)
         kept = np.clip(kept, kernel.memory.low, kernel.memory.high).astype(np.int64)
         q = np.concatenate([q, integers.remembered(kernel, kept, saturated)], axis=-1)
-    return integers.network(kernel, q).astype(np.float32) * kernel.act_lsb
+    return integers.network(kernel, q, h)[1].astype(np.float32) * kernel.act_lsb
 
 
 def _memory_lsb(policy: Policy, act_lsb: NDArray[np.float32]) -> Floats:
@@ -222,6 +260,7 @@ def _memory(policy: Policy, kernel: Kernel, shift: Ints, floor: Floats, ceiling:
         shift=shift + np.where(np.arange(len(shift)) < actions, 0, bits),
         low=np.clip(np.round(floor / step), low, high).astype(np.int64),
         high=np.clip(np.round(ceiling / step), low, high).astype(np.int64),
+        units=policy.memory.units,
     )
 
 
@@ -278,9 +317,16 @@ def _check(policy: Policy) -> None:
             raise UnsupportedNetwork(f"layer {i}: a weight is not finite")
     if policy.memory and not policy.memory_size:
         raise UnsupportedNetwork("a memory that holds nothing")
-    expected = len(policy.observations) + policy.memory_size
+    units = policy.memory.units if policy.memory else 0
+    if units != (policy.unit.of_memory[0].shape[0] if policy.unit else 0) or (units and len(policy.layers) < 2):
+        raise UnsupportedNetwork("a recurrent unit: expected a hidden layer before it, and its numbers in the memory")
+    if policy.unit:
+        layers = policy.unit.gates, policy.unit.of_input, policy.unit.of_memory
+        if not all(np.isfinite(x).all() for layer in layers for x in layer):
+            raise UnsupportedNetwork("the recurrent unit: a weight is not finite")
+    expected = len(policy.observations) + policy.memory_size - units
     if frame := policy.body_frame:
-        expected = frame.size + policy.memory_size + frame.added
+        expected = frame.size + policy.memory_size - units + frame.added
         if len(policy.observations) != frame.measured or np.any(policy.observation_offset[: frame.measured]):
             raise UnsupportedNetwork(
                 f"the body frame: expected {frame.measured} observations of a vehicle, not standardized"
@@ -316,23 +362,42 @@ def _activation_ranges(layers: list[Layer], activation: str, x: Floats) -> list[
     return ranges
 
 
-def _sensitivity(policy: Policy, layers: list[Layer], x: Floats) -> list[Floats]:
-    """Per layer: squared derivative [n, outputs] of the action, in full scales, by its outputs before activation."""
+def _sensitivity(policy: Policy, layers: list[Layer], x: Floats, h: Floats) -> tuple[list[Floats], list[Floats]]:
+    """Per layer: squared derivative [n, outputs] of the action, in full scales, by its outputs before activation; and
+    the same of a recurrent unit's sums.
+    """
     slopes: list[Floats] = []
     for weight, bias in layers[:-1]:
         z = x @ weight + bias
         x = ACTIVATIONS[policy.activation](z)
         slopes.append((z > 0).astype(np.float64) if policy.activation == "relu" else 1.0 - x**2)
     weight, bias = layers[-1]
-    action = x @ weight + bias
+    action = (policy.unit(x, h) if policy.unit else x) @ weight + bias
     low, high = policy.limits
     gain = np.where((action >= low) & (action <= high), 1.0, CLIPPED) / (high - low)
     sensitivity = [gain**2]
-    by_action = [gain[:, [k]] * np.eye(len(low))[k] for k in range(len(low))]
-    for (weight, _), slope in zip(layers[:0:-1], slopes[::-1], strict=True):
-        by_action = [derivative @ weight.T * slope for derivative in by_action]
-        sensitivity.insert(0, sum(derivative**2 for derivative in by_action) + np.zeros_like(slope))
-    return sensitivity
+    by_action = [gain[:, [k]] * np.eye(len(low))[k] @ weight.T for k in range(len(low))]  # of the last layer's inputs
+    of_unit: list[Floats] = []
+    if unit := policy.unit:
+        gates, of_input, of_memory = unit.sums(x, h)
+        (r, z), n = np.split(sigmoid(gates), 2, axis=-1), np.tanh(of_input + sigmoid(gates)[:, : h.shape[1]] * of_memory)
+        of_candidate = (1.0 - z) * (1.0 - n**2)
+        by_sums = [
+            (
+                np.concatenate([d * of_candidate * of_memory * r * (1.0 - r), d * (h - n) * z * (1.0 - z)], axis=1),
+                d * of_candidate,
+                d * of_candidate * r,
+            )
+            for d in by_action
+        ]
+        of_unit = [sum(part**2 for part in parts) + np.zeros(()) for parts in zip(*by_sums, strict=True)]
+        own, candidate = unit.gates[0][: x.shape[1]], unit.of_input[0]
+        by_action = [of_gates @ own.T + of_sum @ candidate.T for of_gates, of_sum, _ in by_sums]
+    for i in range(len(slopes) - 1, -1, -1):
+        by_action = [derivative * slopes[i] for derivative in by_action]
+        sensitivity.insert(0, sum(derivative**2 for derivative in by_action) + np.zeros_like(slopes[i]))
+        by_action = [derivative @ layers[i][0].T for derivative in by_action]
+    return sensitivity, of_unit
 
 
 def _steps(ranges: Floats, weight: Floats, levels: int) -> Floats:

@@ -77,8 +77,9 @@ def packed(kernel: Kernel, state: NDArray[np.int64]) -> NDArray[np.uint8]:
     """States [n, S] as bytes: the fields of NAME_state in their order; of a policy without memory, its unused byte."""
     if kernel.memory is None:
         return np.zeros((len(state), 1), np.uint8)
-    at = 0 if kernel.memory.initial_action is None else len(kernel.memory.initial_action)
-    parts = state[:, at:].astype("<i4"), state[:, :at].astype("<i2")
+    memory = kernel.memory
+    previous, total, h = np.split(state, [memory.actions, len(memory.shift)], axis=1)
+    parts = total.astype("<i4"), previous.astype("<i2"), h.astype("<i2")
     return np.concatenate([np.ascontiguousarray(part).view(np.uint8) for part in parts], axis=1)
 
 

@@ -64,7 +64,8 @@ typedef uint16_t factors;
 #define PREVIOUS_ACTION @previous_action@ /* inputs of the network after the observation: the previous action, */
 #define INTEGRAL @integral@        /* then the integral of so many components of the error, */
 #define POSITIONS @positions@       /* which follows from so many coordinates of the position */
-#define MEMORY (PREVIOUS_ACTION || INTEGRAL)
+#define UNITS @units@ /* numbers of a recurrent unit before the last layer */
+#define MEMORY (PREVIOUS_ACTION || INTEGRAL || UNITS)
 #define SEEN @seen@ /* inputs of the network that follow from the observation */
 #define TURN @turn@ /* whether they are in the body frame */
 #define KEPT @kept@ /* inputs that are remembered */
@@ -98,7 +99,7 @@ struct golden {
     int8_t status, status_i16;
 };
 
-#if MEMORY
+#if KEPT
 struct kept {
     uint8_t shift; /* an input is a value of the state / 2^shift, */
     int16_t least; /* saturated at least and most */
@@ -219,14 +220,21 @@ static inline int32_t saturated(int32_t z) {
 #endif
 }
 
-#if TANH
+#if TANH || UNITS
 
-/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8. */
-static inline int32_t activated(int32_t z) {
-    z = saturated(z);
+/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; z within 16 bits. */
+static inline int32_t tanh_of(int32_t z) {
     const int16_t *const at = tanh_table + 128 + (z >> 8);
     const int32_t low = at[0];
     return low + (((at[1] - low) * (z & 255) + 128) >> 8);
+}
+
+#endif
+
+#if TANH
+
+static inline int32_t activated(int32_t z) {
+    return tanh_of(saturated(z));
 }
 
 #else
@@ -296,9 +304,9 @@ static inline void four_outputs(union activations *y, int at, const struct four 
 
 #endif
 
-/* One layer, four outputs at a time. */
-static void dense(const struct layer *l, const union activations *in, union activations *y) {
-    const activation *const x = in->one, *const last = x + l->inputs;
+/* One layer, four outputs at a time; x is aligned to pairs. */
+static void dense(const struct layer *l, const activation *x, union activations *y) {
+    const activation *const last = x + l->inputs;
     const weight *w = l->weights;
     const int32_t *bias = l->biases;
     const factors *factor = l->of_rows;
@@ -322,14 +330,65 @@ static void dense(const struct layer *l, const union activations *in, union acti
     }
 }
 
+#if MEMORY || TURN
+
+static inline int32_t limited(int32_t x, int32_t least, int32_t most) {
+    return x < least ? least : x > most ? most : x;
+}
+
+/* x / 2^shift, rounded; half is rounded up. */
+static inline int32_t shifted(int32_t x, int shift) {
+    return (x + ((int32_t)1 << shift >> 1)) >> shift;
+}
+
+#endif
+
+#if UNITS
+
+/* A sigmoid in 1 / 2^15, of what a layer gives for half of its input. */
+static inline int32_t gate(activation given) {
+    return (tanh_of((int32_t)given - OFFSET) + 32768) >> 1;
+}
+
+/* A gated recurrent unit of three layers: inputs in `a`, then in their place its numbers h.
+   r, z = sigmoid(gates of x and h), n = tanh(of x + r * of h), h = n + (h - n) * z */
+static void remember(const struct layer *l, union activations *a, int16_t h[UNITS]) {
+    union activations gates, of_input, of_memory;
+    activation *const after = a->one + UNIT_INPUTS;
+    for (int i = 0; i < (UNITS + 3) / 4 * 4; ++i) {
+        after[i] = (activation)((i < UNITS ? h[i] : 0) + OFFSET);
+    }
+    dense(l, a->one, &gates);
+    dense(l + 1, a->one, &of_input);
+    dense(l + 2, after, &of_memory);
+    for (int i = 0; i < UNITS; ++i) {
+        const int32_t r = gate(gates.one[i]), z = gate(gates.one[UNITS + i]);
+        const int32_t more = shifted(r * ((int32_t)of_memory.one[i] - OFFSET), 15);
+        const int32_t n = tanh_of(limited((int32_t)of_input.one[i] - OFFSET + more, -32768, 32767));
+        h[i] = (int16_t)(n + shifted((h[i] - n) * z, 15));
+    }
+    for (int i = 0; i < (UNITS + 3) / 4 * 4; ++i) {
+        a->one[i] = (activation)((i < UNITS ? h[i] : 0) + OFFSET);
+    }
+}
+
+#endif
+
 /* The outputs of the last layer, for quantized inputs in `a`, padded with zeros. */
-static const activation *network(union activations *a, union activations *b) {
+static const activation *network(union activations *a, union activations *b, @name@_state *state) {
     for (const struct layer *l = layers; l != layers + LAYERS; ++l) {
-        dense(l, a, b);
+#if UNITS
+        if (l == layers + UNIT_LAYER) {
+            remember(l, a, state->recurrent);
+            l += 3;
+        }
+#endif
+        dense(l, a->one, b);
         union activations *const swapped = a;
         a = b;
         b = swapped;
     }
+    (void)state;
     return a->one;
 }
 
@@ -345,19 +404,6 @@ static int put(union activations *x, int i, int32_t q) {
     x->one[i] = (activation)(within + OFFSET);
     return within != q;
 }
-
-#if MEMORY || TURN
-
-static inline int32_t limited(int32_t x, int32_t least, int32_t most) {
-    return x < least ? least : x > most ? most : x;
-}
-
-/* x / 2^shift, rounded; half is rounded up. */
-static inline int32_t shifted(int32_t x, int shift) {
-    return (x + ((int32_t)1 << shift >> 1)) >> shift;
-}
-
-#endif
 
 #if INTEGRAL
 
@@ -447,7 +493,7 @@ static void complete(union activations *x, @name@_state *state) {
     int32_t r[9];
     turn(x, r);
 #endif
-#if MEMORY
+#if KEPT
     for (const struct kept *k = kept; k != kept + KEPT; ++i, ++k) {
         const int at = i - SEEN;
 #if PREVIOUS_ACTION && INTEGRAL
@@ -498,6 +544,11 @@ void @name@_reset(@name@_state *state) {
         state->previous_action[i] = act_first[i];
     }
 #endif
+#if UNITS
+    for (int i = 0; i < UNITS; ++i) {
+        state->recurrent[i] = 0;
+    }
+#endif
 #if !MEMORY
     state->unused = 0;
 #endif
@@ -520,7 +571,7 @@ int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act
         status |= put(&a, i, quantised(in.bits, &inputs[i]));
     }
     complete(&a, state);
-    const activation *const y = network(&a, &b);
+    const activation *const y = network(&a, &b, state);
     for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
         const int16_t steps = action(y[i], i);
 #if PREVIOUS_ACTION
@@ -538,7 +589,7 @@ int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int
         status |= put(&a, i, obs[i]);
     }
     complete(&a, state);
-    const activation *const y = network(&a, &b);
+    const activation *const y = network(&a, &b, state);
     for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
         act[i] = action(y[i], i);
 #if PREVIOUS_ACTION
@@ -561,6 +612,11 @@ static int differs(const @name@_state *state) {
 #if INTEGRAL
     for (int i = 0; i < INTEGRAL; ++i) {
         wrong |= state->integral[i] != golden_integral[i];
+    }
+#endif
+#if UNITS
+    for (int i = 0; i < UNITS; ++i) {
+        wrong |= state->recurrent[i] != golden_recurrent[i];
     }
 #endif
     return wrong;
