@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import policies
+from literal_network import limited, literal_network
 from policies import FLAT, HOVER, ODD, PENDULUM
 from qrl.export import kernel as reference
 from qrl.export import vectors
@@ -19,10 +20,6 @@ from qrl.export.kernel import INT16, AccumulatorOverflow, Dense, Kernel, accumul
 
 SHAPES = pytest.mark.parametrize("sizes", [HOVER, PENDULUM, ODD, FLAT], ids=str)
 ACTIVATIONS = pytest.mark.parametrize("activation", ["relu", "tanh"])
-
-
-def limited(value: int, least: int, most: int) -> int:
-    return least if value < least else most if value > most else value
 
 
 def bits_of(real: float) -> int:
@@ -44,36 +41,11 @@ def literal_inputs(kernel: Kernel, observation: list[int]) -> list[int] | None:
     return found
 
 
-def literal_tanh(z: int) -> int:
-    place, part = (z + 2**15) // 2**8, (z + 2**15) % 2**8
-    low, high = (round(math.tanh(-6.0 + 12.0 * (place + k) / 256) * 32767) for k in (0, 1))
-    return low + ((high - low) * part + 128) // 256
-
-
-def literal_network(kernel: Kernel, x: list[int]) -> list[int]:
-    for at, layer in enumerate(kernel.layers):
-        y = []
-        for o in range(len(layer.bias)):
-            acc = int(layer.bias[o])
-            for i in range(len(x)):
-                acc += int(layer.weight[o, i]) * x[i]
-            assert abs(acc) < 2**31
-            z = acc * int(layer.multiplier[o]) // 2 ** (16 + layer.shift)
-            if at == len(kernel.layers) - 1:
-                y.append(limited(limited(z, -(2**15), 2**15 - 1), int(kernel.act_min[o]), int(kernel.act_max[o])))
-            elif kernel.activation == "relu":
-                y.append(limited(z, 0, 2**15 - 1))
-            else:
-                y.append(literal_tanh(limited(z, -(2**15), 2**15 - 1)))
-        x = y
-    return x
-
-
 def literal(kernel: Kernel, wanted: list[int]) -> tuple[int, list[int]]:
     """Status and action in steps."""
     limits = zip(wanted, kernel.obs_min, kernel.obs_max, strict=True)
     x = [limited(q, int(low), int(high)) for q, low, high in limits]
-    return int(x != wanted), literal_network(kernel, x)
+    return int(x != wanted), literal_network(kernel, x, [])[1]
 
 
 def some(sizes: tuple[int, ...], activation: str, n: int, seed: int = 1) -> np.ndarray:

@@ -10,7 +10,17 @@ import numpy as np
 from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.kernel import Kernel
-from qrl.export.policy import ACTIVATIONS, ActionSpec, BodyFrame, Integral, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import (
+    ACTIVATIONS,
+    ActionSpec,
+    BodyFrame,
+    GatedUnit,
+    Integral,
+    Memory,
+    ObservationSpec,
+    Policy,
+    Provenance,
+)
 from qrl.export.quantize import quantize
 from qrl.export.vectors import Vectors
 from qrl_envs import io_spec
@@ -134,10 +144,22 @@ REMEMBERING = {
     "integral": (HOVER, Memory(False, Integral((9, 10, 11), radius_m=0.3, limit_m_s=0.05))),
     "one action": (PENDULUM, Memory(True, Integral((2, 0, 1), radius_m=3.0, limit_m_s=1.0))),
     "odd": (ODD, Memory(True, Integral((1, 4, 3), radius_m=25.0, limit_m_s=20.0))),
+    "recurrent": (TRACK, Memory(True, Integral((9, 10, 11), radius_m=0.5, limit_m_s=0.6), units=10)),
+    "recurrent alone": (ODD, Memory(False, None, units=7)),
 }
 
 
 FRAMES = {"circle": BodyFrame(False, 0, 2), "track": BodyFrame(True, 2, 3), "body": BodyFrame(False, 0, 0)}
+FRAMES["recurrent"] = FRAMES["track"]
+
+
+def gated_unit(rng: np.random.Generator, inputs: int, units: int) -> GatedUnit:
+    """A lively one: gates and candidate spread over their ranges."""
+
+    def layer(rows: int, outputs: int) -> tuple[np.ndarray, np.ndarray]:
+        return rng.normal(size=(rows, outputs)) * (2.0 / rows) ** 0.5, 0.5 * rng.normal(size=outputs)
+
+    return GatedUnit(layer(inputs + units, 2 * units), layer(inputs, units), layer(units, units))
 
 
 def in_body_frame(base: Policy, frame: BodyFrame) -> Policy:
@@ -172,8 +194,14 @@ def remembering(which: str = "both", activation: str = "relu") -> Policy:
     scale = rng.uniform(0.5, 1.0, memory.size(actions))
     if frame and frame.last:
         scale[-frame.last :] = 0.7  # a vector: the same along its axes
+    unit = None
+    if memory.units:
+        unit = gated_unit(rng, len(hidden[-1][1]) if hidden else len(bias), memory.units)
+        columns.append(rng.uniform(-1.0, 1.0, (n, memory.units)))
+        last = rng.normal(size=(memory.units, actions))
     made = replace(
         base,
+        unit=unit,
         memory=memory,
         observation_offset=np.concatenate(offset),
         observation_gain=np.concatenate(gain),
@@ -207,15 +235,38 @@ def literal_view(row: np.ndarray, heading: bool, vectors: int, last: int) -> lis
 
 def outputs(policy: Policy, inputs: np.ndarray) -> np.ndarray:
     """The network's own outputs [n, A], written apart from Policy."""
+    return outputs_and_unit(policy, inputs)[0]
+
+
+def outputs_and_unit(policy: Policy, inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The network's own outputs [n, A] and its next h [n, H], written apart from Policy."""
+    inputs, h = inputs[:, : len(policy.observation_scale)], inputs[:, len(policy.observation_scale) :].astype(float)
     x = (inputs.astype(np.float64) - policy.observation_offset) * policy.observation_gain
     x = np.minimum(np.maximum(x, -policy.observation_clip), policy.observation_clip) * policy.observation_scale
     if frame := policy.body_frame:
         x = np.array([literal_view(row, *astuple(frame)) for row in x])
     for i, (weight, bias) in enumerate(policy.layers):
+        if policy.unit and i == len(policy.layers) - 1:
+            x = h = literal_unit(policy.unit, x, h)
         x = np.einsum("ni,io->no", x, weight) + bias
         if i < len(policy.layers) - 1:
             x = ACTIVATIONS[policy.activation](x)
-    return x
+    return x, h
+
+
+def literal_unit(unit: GatedUnit, x: np.ndarray, h: np.ndarray) -> np.ndarray:
+    """The next h [n, H], number by number."""
+    (weight, bias), (of_x, bias_x), (of_h, bias_h) = unit.gates, unit.of_input, unit.of_memory
+    after = np.empty_like(h)
+    for k in range(len(h)):
+        both = [*x[k], *h[k]]
+        sums = [bias[j] + sum(both[i] * weight[i, j] for i in range(len(both))) for j in range(2 * h.shape[1])]
+        for j in range(h.shape[1]):
+            r, z = (1.0 / (1.0 + np.exp(-sums[at])) for at in (j, h.shape[1] + j))
+            own = bias_h[j] + sum(h[k, i] * of_h[i, j] for i in range(h.shape[1]))
+            n = np.tanh(bias_x[j] + sum(x[k, i] * of_x[i, j] for i in range(x.shape[1])) + r * own)
+            after[k, j] = z * h[k, j] + (1.0 - z) * n
+    return after
 
 
 @cache
