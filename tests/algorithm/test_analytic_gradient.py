@@ -63,8 +63,8 @@ class Pushed(Env):
         return State(None, obs, self.constant - obs[0] ** 2, done, info={"out_of_bounds": done * (obs[0] < 0.0)})
 
 
-def linear(gain: jax.Array) -> analytic_gradient.Mean:
-    return lambda observation: observation @ gain[:, None]
+def linear(gain: jax.Array) -> analytic_gradient.Act:
+    return lambda memory, observation: (memory, observation @ gain[:, None])
 
 
 def literal(env: Env, gain: jax.Array, sigma: float, key: jax.Array, steps: int) -> tuple[jax.Array, bool]:
@@ -86,7 +86,7 @@ EDGE, SIGMA, STEPS = 1.1, 0.3, 8
 
 
 def flights(env: Env, gain: jax.Array, keys: jax.Array = KEYS) -> tuple[jax.Array, jax.Array]:
-    return jax.jit(lambda gain: analytic_gradient.returns(env, linear(gain), jnp.float32(SIGMA), keys, STEPS))(gain)
+    return jax.jit(lambda gain: analytic_gradient.returns(env, linear(gain), (), jnp.float32(SIGMA), keys, STEPS))(gain)
 
 
 @pytest.mark.parametrize("constant", [0.0, 5.0])
@@ -164,7 +164,7 @@ def test_updates_raise_the_return_and_move_the_policy_alone() -> None:
     keys = jax.random.split(jax.random.PRNGKey(0), 32)
 
     def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
-        return analytic_gradient.returns(env, lambda o: ours.mean(now, o), jnp.float32(0.0), keys, 20)
+        return analytic_gradient.returns(env, lambda m, o: (m, ours.mean(now, o)), (), jnp.float32(0.0), keys, 20)
 
     update = jax.jit(lambda now, i: ours.apg_update(now, flown, i, ours.config.num_apg_updates))
     state = first = ours.init(jax.random.PRNGKey(1))
@@ -451,12 +451,14 @@ class Growing(Env):
 
 @pytest.mark.parametrize("limit", [1e-3, 0.1, 1e9])
 def test_the_gradient_with_respect_to_a_state_is_cut(limit: float) -> None:
-    """At each step and for each flight by itself, as in a literal reverse pass; what is not above the limit stays."""
+    """That of state and observation together, at each step and for each flight by itself, as in a literal reverse pass;
+    what is not above the limit stays.
+    """
     steps, gain, keys = 8, 0.4, jax.random.split(jax.random.PRNGKey(0), 5)
 
     def total(k: jax.Array) -> jax.Array:
         values, _ = analytic_gradient.returns(
-            Growing(), linear(k[None]), jnp.float32(0.0), keys, steps, jnp.float32(limit)
+            Growing(), linear(k[None]), (), jnp.float32(0.0), keys, steps, jnp.float32(limit)
         )
         return values.sum()
 
@@ -469,8 +471,8 @@ def test_the_gradient_with_respect_to_a_state_is_cut(limit: float) -> None:
         assert max(map(abs, x)) * gain < 1.0  # no action is clipped
         of_state = of_observation = 0.0
         for t in range(steps, 0, -1):
-            cut = of_state * min(1.0, limit / max(abs(of_state), 1e-12))
-            raw = cut + of_observation - 2.0 * x[t]
+            share = min(1.0, limit / max((of_state**2 + of_observation**2) ** 0.5, 1e-12))
+            raw = share * (of_state + of_observation) - 2.0 * x[t]
             expected += raw * 0.3 * x[t - 1]
             of_state, of_observation = 1.5 * raw, 0.3 * gain * raw
     assert ours == pytest.approx(expected, rel=1e-4)

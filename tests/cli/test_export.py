@@ -149,7 +149,7 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
     seen = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)).astype(np.float32)
     inputs = inputs_in_si(policy, seen)
     np.testing.assert_allclose(inputs, seen * [1.0, 1.0, 2.0])  # the greatest torque is 2 N m
-    wanted = 2.0 * np.clip(np.asarray(loaded.policy_mean(seen)), -1.0, 1.0)
+    wanted = 2.0 * np.clip(np.asarray(loaded.act((), seen)[1]), -1.0, 1.0)
     assert np.ptp(wanted) > 1e-3
     np.testing.assert_allclose(policy(inputs), wanted, atol=1e-5)
     memory, action = policy.step(inputs[:, 2:], inputs[:, :2])
@@ -174,7 +174,7 @@ def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], input
     seen = np.array(jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
     remembered = slice(policy.body_frame.measured, env.policy_observation_size)
     seen[:, remembered] = np.random.default_rng(0).uniform(-0.5, 0.5, seen[:, remembered].shape)
-    wanted = policy.to_si(np.asarray(loaded.policy_mean(seen)))
+    wanted = policy.to_si(np.asarray(loaded.act((), seen)[1]))
     assert np.ptp(wanted, axis=0).min() > 1e-4
     np.testing.assert_allclose(policy(inputs_in_si(policy, seen)), wanted, atol=1e-6)
     assert qrl("export", run, *LEAST) == 0

@@ -32,13 +32,17 @@ class BoundLearner:
         other._bind(hyper)
         return other
 
+    def mean(self, state: Any, observation: Any) -> Any:
+        """Mean action of a feed-forward policy."""
+        return self.act(state, (), observation)[1]
+
     def _bind(self, hyper: Hyperparameters) -> None:
         def bound(function: Any) -> Any:
             return partial(function, self.spec, hyper)
 
         self.hyper = hyper
         self.init, self.update, self.loss = bound(learner.init), bound(learner.update), bound(learner._loss)
-        self.mean, self.preprocess = bound(learner.policy_mean), bound(learner.preprocess)
+        self.act, self.preprocess = bound(learner.act), bound(learner.preprocess)
         self.sigma = partial(learner.sigma, hyper)
         self.deployed = partial(learner.deployed, self.spec)
         self.update_statistics = partial(learner.update_statistics, self.spec)

@@ -64,8 +64,8 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Seen:
 
     def unroll(*args: Any, **kwargs: Any) -> Any:
         lanes, transitions = original_unroll(*args, **kwargs)
-        mean, sigma = args[2:4]
-        seen.value("noise", (transitions.action - mean(transitions.observation)) / sigma)
+        policy, sigma = args[2:4]
+        seen.value("noise", (transitions.action - policy((), transitions.observation)[1]) / sigma)
         return lanes, transitions
 
     def gather(buffer: Any, index: jax.Array) -> Any:
@@ -76,9 +76,9 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Seen:
         seen.value("symmetry", draws)
         return original_augment(env, batch, draws)
 
-    def returns(env: Any, mean: Any, sigma: Any, keys: Any, *more: Any) -> Any:
+    def returns(env: Any, policy: Any, memory: Any, sigma: Any, keys: Any, *more: Any) -> Any:
         seen.value("start", jax.vmap(lambda key: original_uniform(original_split(key)[0], (2,)))(keys))
-        return original_returns(env, mean, sigma, keys, *more)
+        return original_returns(env, policy, memory, sigma, keys, *more)
 
     original_unroll, original_gather, original_augment = rollout.unroll, replay_buffer.gather, augmentation.augment
     original_returns = trainer.analytic_gradient.returns
