@@ -207,7 +207,10 @@ class QuadrotorEnv(TaskEnv):
         super().__init__(task, params, observation_size=18, action_size=len(task.vehicle.motors))
 
     def reset_calibration(self, rng: chex.PRNGKey) -> State:
-        return self._reset(self.params._replace(start=quadrotor.start(self.task.envelope)), rng)
+        # With the structure of the task's own start, beside which it stands in one program.
+        nested = jax.tree.map(jnp.zeros_like, self.params.start.nested)
+        start = quadrotor.start(self.task.envelope)._replace(nested=nested)
+        return self._reset(self.params._replace(start=start), rng)
 
     def _draw(self, params: Params, rng: chex.PRNGKey) -> Any:
         return quadrotor.draw(params.start, rng)

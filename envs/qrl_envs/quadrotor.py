@@ -53,6 +53,7 @@ class Start(NamedTuple):
     velocity_m_s: chex.Array  # world
     body_rate_rad_s: chex.Array  # body
     tilt_rad: chex.Array  # greatest tilt from upright
+    nested: chex.Array | None = None  # 1, or 0 in the place of it: each start shrinks all ranges by a factor of its own
 
 
 def physics(vehicle: Vehicle) -> Physics:
@@ -74,7 +75,8 @@ def physics(vehicle: Vehicle) -> Physics:
 
 def start(ranges: FlightStart) -> Start:
     """The start ranges of a task file."""
-    return Start(*(jnp.float32(getattr(ranges, field)) for field in Start._fields))
+    nested = jnp.float32(1.0) if ranges.nested else None
+    return Start(*(jnp.float32(getattr(ranges, field)) for field in Start._fields[:-1]), nested)
 
 
 def thrust_N(physics: Physics, action: chex.Array) -> chex.Array:
@@ -190,6 +192,9 @@ def draw(start: Start, key: chex.PRNGKey) -> Body:
     """A random start: attitude uniform within the tilt, every other coordinate uniform within ± its range."""
     u = jax.random.uniform(key, (4, 3))  # one draw, because random draws dominate the compile time of a reset
     position, velocity, rate = 2.0 * u[1:] - 1.0
+    if start.nested is not None:
+        shrunk = 1.0 - start.nested * jax.random.uniform(jax.random.fold_in(key, 1))
+        start = Start(*(shrunk * x for x in start[:-1]))
     return Body(
         Pose(start.position_m * position, rotation.uniform(u[0], start.tilt_rad)),
         Twist(start.velocity_m_s * velocity, start.body_rate_rad_s * rate),

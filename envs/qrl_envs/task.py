@@ -16,18 +16,21 @@ from qrl_envs import reference as references
 from qrl_envs import specfile
 from qrl_envs.distribution import VehicleDistribution, distribution_data, shipped_distributions
 from qrl_envs.reference import FixedReference, Reference, reference_data, shipped_references
-from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec
+from qrl_envs.specfile import BadInput, NonNegative, Positive, Real, Spec, later
 from qrl_envs.uncertainty import Uncertainty, shipped_uncertainties, uncertainty_data
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle, shipped_vehicles, vehicle_data, with_default_scale
 
 
 class FlightStart(Spec):
-    """Start ranges: each coordinate is uniform in ±range, the attitude uniform within a tilt from upright."""
+    """Start ranges: each coordinate is uniform in ±range, the attitude uniform within a tilt from upright. With
+    `nested` a flight has ranges of its own: these, times a factor that is uniform in [0, 1].
+    """
 
     position_m: NonNegative  # from the hover point or the circle's center
     velocity_m_s: NonNegative
     body_rate_rad_s: NonNegative
     tilt_rad: Annotated[float, Field(gt=0.0, le=3.141592653589793)] = 3.141592653589793  # the default is all of SO(3)
+    nested: bool = later(default=False)
 
 
 # Includes the paper's trial, which started at 6.7 m/s (its figure of a hovering trial).

@@ -119,6 +119,15 @@ class Config(BaseModel):
     )
     apg_num_envs: Static[Count] = Field(description="flights of one APG update")
     apg_episode_length: Static[Count] = Field(description="steps of one APG flight")
+    apg_split: Static[Count] = Field(
+        default=1,
+        exclude_if=lambda x: x == 1,
+        description="short updates, of flights as many times shorter, that each of the first APG updates is split into:"
+        " long flights teach a policy that cannot fly yet little",
+    )
+    apg_split_fraction: Static[Fraction] = Field(
+        default=0.0, exclude_if=lambda x: x == 0.0, description="first fraction of APG that is split"
+    )
     apg_cotangent_norm: Traced[Positive | None] = Field(
         default=None,
         exclude_if=lambda x: x is None,  # a run of before it was there has the same fingerprint
@@ -163,6 +172,11 @@ class Config(BaseModel):
                 )
         if self.policy_gru_size and self.symmetries:
             raise ValueError("expected symmetries false with policy_gru_size: a stored memory cannot be transformed")
+        if self.apg_episode_length % self.apg_split:
+            raise ValueError(
+                f"expected apg_episode_length to be a multiple of apg_split = {self.apg_split}, found"
+                f" {self.apg_episode_length}"
+            )
         for name in ("num_envs", "batch_size", *(["apg_num_envs"] if self.num_apg_updates else [])):
             if (value := getattr(self, name)) % self.shard_count:
                 raise ValueError(f"expected {name} to be a multiple of num_shards = {self.shard_count}, found {value}")
@@ -206,7 +220,7 @@ class Config(BaseModel):
 
     @property
     def num_apg_updates(self) -> int:
-        """APG updates at the end of the run."""
+        """APG updates at the end of the run, each split one counted once."""
         return int(self.num_unrolls * self.apg_fraction) // self.unrolls_per_apg_update
 
     @property

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +18,11 @@ from bound_learner import BoundLearner
 from fault_injection import assert_same_leaves, leaves
 from qrl import tasks
 from qrl.algorithm import analytic_gradient
+from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerState
 from qrl.config import Config, load_preset, preset_names
 from qrl.runs import checkpoint, files
-from qrl.training import driver
+from qrl.training import driver, trainer
 from qrl.training.state import FAULT_TERMS, MemberInputs, TrainState, stack
 from qrl.training.trainer import Trainer
 from qrl_envs.specfile import BadInput
@@ -166,7 +168,7 @@ def test_updates_raise_the_return_and_move_the_policy_alone() -> None:
     def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
         return analytic_gradient.returns(env, lambda m, o: (m, ours.mean(now, o)), (), jnp.float32(0.0), keys, 20)
 
-    update = jax.jit(lambda now, i: ours.apg_update(now, flown, i, ours.config.num_apg_updates))
+    update = jax.jit(lambda now, i: ours.apg_update(now, flown, i / ours.config.num_apg_updates))
     state = first = ours.init(jax.random.PRNGKey(1))
     sums = jnp.zeros(2)
     for i in range(30):
@@ -194,12 +196,12 @@ def test_the_first_update_begins_with_the_deployed_policy_and_a_new_optimizer() 
         return sum(jnp.sum(3.0 * x) for x in jax.tree.leaves(now.params.policy))[None], jnp.ones(1)
 
     planned = jnp.int32(300)
-    after, terms, _, _ = ours.apg_update(state, flown, jnp.int32(0), planned)
+    after, terms, _, _ = ours.apg_update(state, flown, jnp.int32(0) / planned)
     ships = policy_of(state._replace(params=state.params._replace(policy=average)))
     np.testing.assert_allclose(policy_of(after) - ships, ours.config.apg_learning_rate, rtol=1e-3)
     np.testing.assert_allclose(terms.policy_gradient, 3.0 * np.sqrt(len(ships)), rtol=1e-5)
     for step, share in ((75, 0.75), (150, 0.5), (299, 1 / 300)):
-        later, *_ = ours.apg_update(after, flown, jnp.int32(step), planned)
+        later, *_ = ours.apg_update(after, flown, jnp.int32(step) / planned)
         expected = ours.config.apg_learning_rate * share**1.5
         np.testing.assert_allclose(policy_of(later) - policy_of(after), expected, rtol=0.05, atol=3e-7)
 
@@ -213,7 +215,7 @@ def test_a_gradient_that_is_not_finite_is_not_followed() -> None:
         return jnp.stack(slopes), jnp.ones(1)
 
     state = state._replace(optimizer=jax.tree.map(lambda x: x + jnp.ones_like(x), state.optimizer))  # a momentum
-    after, terms, _, skipped = ours.apg_update(state, flown, jnp.int32(1), jnp.int32(9))
+    after, terms, _, skipped = ours.apg_update(state, flown, jnp.int32(1) / 9)
     assert skipped
     np.testing.assert_array_equal(policy_of(after), policy_of(state))
     jax.tree.map(np.testing.assert_array_equal, after.optimizer, state.optimizer)
@@ -476,3 +478,29 @@ def test_the_gradient_with_respect_to_a_state_is_cut(limit: float) -> None:
             expected += raw * 0.3 * x[t - 1]
             of_state, of_observation = 1.5 * raw, 0.3 * gain * raw
     assert ours == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_first_updates_are_split_into_shorter_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as the fraction says, each with flights, keys and a progress of its own; the steps are the same."""
+    config = run_config(**WITH_APG, apg_split=4, apg_split_fraction=0.4).learner
+    assert config.num_apg_updates == 6
+    seen = []
+
+    def update(*args: Any) -> TrainState:
+        _, _, key, progress, length, state = args
+        seen.append((key.tolist(), float(progress), length))
+        return state
+
+    monkeypatch.setattr(trainer, "_apg_update", update)
+    env = adapt(small_run.pendulum())
+    state = type("", (), {"learning_unrolls": jnp.int32(config.learning_unrolls), "key": jax.random.PRNGKey(0)})()
+    with jax.disable_jit():
+        for step in range(6):
+            monkeypatch.setattr(jax.lax, "fori_loop", lambda low, high, body, x: [body(i, x) for i in range(high)][-1])
+            trainer.apg_step(trainer.Setup(env, config), None, jnp.int32(step), state)  # pyright: ignore
+    assert [length for *_, length in seen] == [5] * 12 + [20] * 3
+    progress = [p for _, p, _ in seen]
+    np.testing.assert_allclose(progress, [*np.arange(12) / 24, 0.5, 4 / 6, 5 / 6], rtol=1e-6)
+    assert len({tuple(key) for key, *_ in seen}) == 15
+    with pytest.raises(ValidationError, match="expected apg_episode_length to be a multiple of apg_split = 3"):
+        run_config(**WITH_APG, apg_split=3)

@@ -175,7 +175,7 @@ def traced() -> tuple[Hyperparameters, object]:
     def decided(values: Hyperparameters) -> tuple[LearnerState, UpdateMetrics, jax.Array, LearnerState]:
         other = learner.with_hyper(values)
         apg, *_ = other.apg_update(
-            state, lambda now: (other.mean(now, data.observation).sum(axis=(1, 2)), jnp.ones(B)), jnp.int32(0), 9
+            state, lambda now: (other.mean(now, data.observation).sum(axis=(1, 2)), jnp.ones(B)), jnp.float32(0.0)
         )
         return *other.update(state, data), other.sigma(state), apg
 

@@ -108,12 +108,12 @@ def _constant_leaves(env: TaskEnv, states: State, action: chex.Array) -> Any:
     return jax.tree.unflatten(structure, same)
 
 
-def decay(step: chex.Array, updates: chex.Array) -> chex.Array:
-    """Factor on step size and noise of APG update `step` of `updates`, from 1 to 0; int32 [] both.
+def decay(progress: chex.Array) -> chex.Array:
+    """Factor on step size and noise at a `progress` of APG in [0, 1), from 1 to 0; [].
 
     (1 − progress)^1.5: with a linear decay policies still wandered by 2 mm near the end (docs/profile.md).
     """
-    return (1.0 - step / jnp.maximum(1, updates)) ** 1.5
+    return (1.0 - progress) ** 1.5
 
 
 def update(
@@ -121,25 +121,24 @@ def update(
     hyper: Hyperparameters,
     state: LearnerState,
     returns_of: Callable[[LearnerState], tuple[chex.Array, chex.Array]],
-    step: chex.Array,
-    updates: chex.Array,
+    progress: chex.Array,
 ) -> tuple[LearnerState, UpdateMetrics, chex.Array, chex.Array]:
     """One step up the mean return; also the sums of returns and of complete flights over all devices [2], and whether
     the step was skipped (bool []).
 
-    `returns_of` gives returns [n], differentiable in the policy, and whether each flight is complete [n]. `step` is the
-    number of this update, of `updates`: int32 []. The first starts from the deployed policy with a new optimizer.
+    `returns_of` gives returns [n], differentiable in the policy, and whether each flight is complete [n]. `progress` []
+    is the fraction of APG that is done. The first starts from the deployed policy with a new optimizer.
     Flights can be chaotic: where the gradient is not finite, the step is skipped: policy and optimizer stay.
     """
     before = learner.deployed(spec, state).params.policy
-    optimizer = jax.tree.map(lambda x: jnp.where(step == 0, 0, x).astype(x.dtype), state.optimizer.policy)
+    optimizer = jax.tree.map(lambda x: jnp.where(progress == 0, 0, x).astype(x.dtype), state.optimizer.policy)
 
     def loss(policy: chex.ArrayTree) -> tuple[chex.Array, chex.Array]:
         values, complete = returns_of(state._replace(params=state.params._replace(policy=policy)))
         return -jnp.mean(values), jnp.stack([jnp.mean(values), jnp.mean(complete)])
 
     gradient, means = learner.mean_over_devices(spec, jax.grad(loss, has_aux=True)(before))
-    rate = decay(step, updates) * hyper.apg_learning_rate
+    rate = decay(progress) * hyper.apg_learning_rate
     after, optimizer_after, norm = learner.apply_gradient(hyper, before, gradient, optimizer, rate)
     finite = jnp.isfinite(norm)
     policy, optimizer = jax.tree.map(

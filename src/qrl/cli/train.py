@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import os
 import shlex
 import time
@@ -197,7 +198,8 @@ def _describe_steps(config: Config) -> str:
     if not config.num_apg_updates:
         return f"{config.num_timesteps:,} steps"
     learning = config.learning_unrolls * config.steps_per_unroll
-    apg = f"{config.num_apg_updates:,} APG updates"
+    split = math.ceil(config.num_apg_updates * config.apg_split_fraction) * (config.apg_split - 1)
+    apg = f"{config.num_apg_updates + split:,} APG updates"
     return f"{config.num_timesteps:,} steps ({learning:,} of the paper's method, then {apg})"
 
 

@@ -200,26 +200,47 @@ def _first_fault(collected: chex.Array, metrics: chex.Array, updates: chex.Array
 
 
 def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainState) -> TrainState:
-    """APG update number `step` (int32 []); the counter of unrolls is left to the caller."""
-    config, spec, env = setup.config, setup.spec, setup.env_of(inputs)
-    key = jax.random.fold_in(state.key, state.learning_unrolls + step)
+    """APG update number `step` (int32 []), or as many shorter ones as it is split into; the counter of unrolls is left
+    to the caller.
+    """
+    config = setup.config
     updates = (config.num_unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
+    key = jax.random.fold_in(state.key, state.learning_unrolls + step)
+    parts = config.apg_split
+
+    def whole(state: TrainState) -> TrainState:
+        return _apg_update(setup, inputs, key, step / jnp.maximum(1, updates), config.apg_episode_length, state)
+
+    def part(i: chex.Array, state: TrainState) -> TrainState:
+        progress = (step + i / parts) / jnp.maximum(1, updates)
+        length = config.apg_episode_length // parts
+        return _apg_update(setup, inputs, jax.random.fold_in(key, i), progress, length, state)
+
+    if parts == 1:
+        return whole(state)
+    is_split = step < updates * config.apg_split_fraction
+    return jax.lax.cond(is_split, lambda state: jax.lax.fori_loop(0, parts, part, state), whole, state)
+
+
+def _apg_update(
+    setup: Setup, inputs: MemberInputs, key: chex.PRNGKey, progress: chex.Array, length: int, state: TrainState
+) -> TrainState:
+    """One APG update on flights of `length` steps, drawn with `key`."""
+    config, spec, env = setup.config, setup.spec, setup.env_of(inputs)
     lanes = sharding.local_indices(setup.mesh, config.apg_num_envs)
     keys = jax.vmap(lambda lane: jax.random.fold_in(key, lane))(lanes)
 
     def returns_of(now: LearnerState) -> tuple[chex.Array, chex.Array]:
-        noise = learner.sigma(inputs.hyper, now) * analytic_gradient.decay(step, updates)
+        noise = learner.sigma(inputs.hyper, now) * analytic_gradient.decay(progress)
         act, memory = partial(learner.act, spec, inputs.hyper, now), learner.initial_memory(spec, len(keys))
-        return analytic_gradient.returns(
-            env, act, memory, noise, keys, config.apg_episode_length, inputs.hyper.apg_cotangent_norm
-        )
+        return analytic_gradient.returns(env, act, memory, noise, keys, length, inputs.hyper.apg_cotangent_norm)
 
     now, metrics, (rewards, complete), skipped = analytic_gradient.update(
-        spec, inputs.hyper, state.learner, returns_of, step, updates
+        spec, inputs.hyper, state.learner, returns_of, progress
     )
     added = Totals(
         rewards=rewards,
-        steps=jnp.float32(config.apg_num_envs * config.apg_episode_length),
+        steps=jnp.float32(config.apg_num_envs * length),
         episodes=jnp.float32(config.apg_num_envs),
         early=config.apg_num_envs - complete,
         updates=jnp.float32(1.0),
