@@ -6,7 +6,7 @@ QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train identify evaluate export view sweep seeds tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
+.PHONY: help setup train identify evaluate export view fly sweep seeds tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -29,6 +29,8 @@ define HELP
        NAME=hover                      prefix of all its names in C (default qrl_TASK)
   make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
        ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE
+  make fly VEHICLE=mine.json         a policy that ships and flies any quadrotor, with yours: evaluate and view
+       REFERENCE=eight                 what to follow; RUN=any: which run; ARGS="--starts 1000 --off-nominal"
   make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; rerun to resume
        OUT=runs/pendulum_lr            the folder of its results
        ARGS="--memory-gb 4"            any other flag of `qrl sweep`
@@ -74,6 +76,7 @@ $(call need,sweep,$(GRID),GRID is missing: make sweep GRID=experiments/grids/pen
 $(call need,evaluate,$(RUN),RUN is missing: make evaluate RUN=runs/circle)
 $(call need,export,$(RUN),RUN is missing: make export RUN=runs/circle)
 $(call need,view,$(RUN),RUN is missing: make view RUN=runs/circle)
+$(call need,fly,$(VEHICLE),VEHICLE is missing: make fly VEHICLE=mine.json)
 
 train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
@@ -92,6 +95,10 @@ evaluate: $(STAMP)
 # `export` is a directive of make itself where a line begins with it.
 $(or export): $(STAMP)
 	@exec $(QRL) export $(call quoted,$(RUN)) $(call flag,--name,$(NAME)) $(ARGS)
+
+fly: $(STAMP)
+	@exec $(QRL) fly $(call quoted,$(or $(RUN),any)) $(call flag,--reference,$(REFERENCE)) \
+		$(call flag,--vehicle,$(VEHICLE)) $(ARGS)
 
 view: $(STAMP)
 	@exec $(QRL) view $(call quoted,$(RUN)) $(call flag,--reference,$(REFERENCE)) \

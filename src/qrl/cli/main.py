@@ -95,9 +95,12 @@ def build_parser() -> _Parser:
     evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts")
     export = commands.add_parser("export", help="write a trained policy as a C kernel, and verify it")
     view = commands.add_parser("view", help="write flights of a trained policy as a 3D page")
+    fly = commands.add_parser("fly", help="fly a policy of any vehicle with yours: evaluate and view")
     for command in (evaluate, export, view):
-        command.add_argument("run", type=Path, metavar="RUN", help="run folder")
-    for command in (evaluate, view):
+        command.add_argument("run", type=Path, metavar="RUN", help="run folder, or the name of a run that ships: any")
+    fly.add_argument("run", nargs="?", type=Path, default=Path("any"), metavar="RUN", help="as of evaluate (any)")
+    fly.add_argument("--starts", type=count, default=200, metavar="N", help="number of starts (default 200)")
+    for command in (evaluate, view, fly):
         instead = f"{figure}, in place of the task's own"
         command.add_argument("--reference", metavar="REFERENCE", help=instead)
         other = "of a policy of any vehicle: a shipped vehicle's name or a .json file"
@@ -105,7 +108,8 @@ def build_parser() -> _Parser:
     for command in (evaluate, export):
         command.add_argument("--starts", type=count, default=1000, metavar="N", help="number of starts (default 1000)")
     conditions = "also fly with other lag, latency, mass, thrust, wind, gusts, sensors and control rate"
-    evaluate.add_argument("--off-nominal", action="store_true", help=conditions)
+    for command in (evaluate, fly):
+        command.add_argument("--off-nominal", action="store_true", help=conditions)
     others = "other runs of the same task, a column each"
     evaluate.add_argument("--beside", type=Path, nargs="+", default=[], metavar="RUN", help=others)
     recent = "number of most recent checkpoints to fly (default 1)"
@@ -250,11 +254,14 @@ def _run(args: argparse.Namespace) -> int:
 
     from qrl.export.kernel import AccumulatorOverflow
     from qrl.export.targets import VerificationFailed
+    from qrl.runs import shipped
     from qrl.runs.integrity import IncompatibleCheckpoint
     from qrl.training.driver import NotFinite
 
     code = FAILED
     try:
+        if getattr(args, "run", None):
+            args.run = shipped.run_folder(args.run)
         return _command(args.command)(args)
     except BadInput as error:  # raised on every process
         print_error(str(error))

@@ -1,0 +1,60 @@
+"""The runs that ship, and `qrl fly`."""
+
+import argparse
+from pathlib import Path
+
+import pytest
+
+from qrl.cli import fly as command
+from qrl.cli.main import build_parser
+from qrl.runs import shipped
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A package that ships one run, and an empty working folder."""
+    folder = tmp_path / "package" / "any"
+    (folder / "checkpoints/100").mkdir(parents=True)
+    (folder / "config.json").write_text("{}")
+    (folder / "checkpoints/100/manifest.json").write_text("one")
+    monkeypatch.setattr(shipped, "SHIPPED", folder.parent)
+    (tmp_path / "work").mkdir()
+    monkeypatch.chdir(tmp_path / "work")
+    return folder
+
+
+def test_a_run_that_ships_is_copied_once(package: Path) -> None:
+    """What is made of the copy stays, until another version of the run ships."""
+    copy = shipped.run_folder(Path("any"))
+    assert copy == Path("runs/shipped/any")
+    assert (copy / "checkpoints/100/manifest.json").read_text() == "one"
+    (copy / "view.html").touch()
+    assert shipped.run_folder(Path("any")) == copy
+    assert (copy / "view.html").exists()
+    (package / "checkpoints/100/manifest.json").write_text("two")
+    assert shipped.run_folder(Path("any")) == copy
+    assert (copy / "checkpoints/100/manifest.json").read_text() == "two"
+    assert [path.name for path in copy.parent.iterdir()] == ["any"]
+
+
+@pytest.mark.usefixtures("package")
+def test_a_folder_comes_before_a_run_that_ships() -> None:
+    Path("any").mkdir()
+    assert shipped.run_folder(Path("any")) == Path("any")
+    assert shipped.run_folder(Path("runs/mine")) == Path("runs/mine")
+    assert shipped.run_folder(Path("missing")) == Path("missing")
+
+
+def test_fly_judges_and_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all that the two commands read."""
+    seen: list[argparse.Namespace] = []
+    monkeypatch.setattr(command, "evaluate", lambda args: seen.append(args) or 0)
+    monkeypatch.setattr(command, "view", lambda args: seen.append(args) or 0)
+    args = build_parser().parse_args(["fly", "--vehicle", "mine.json", "--starts", "7", "--off-nominal"])
+    assert command.fly(args) == 0
+    for name, given in zip(("evaluate", "view"), seen, strict=True):
+        wanted = vars(build_parser().parse_args([name, "any", "--vehicle", "mine.json"]))
+        wanted.pop("command")
+        if name == "evaluate":
+            wanted |= {"starts": 7, "off_nominal": True}
+        assert vars(given) == wanted
