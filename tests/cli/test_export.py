@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.envs.fast import Fast
@@ -174,9 +175,16 @@ def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], input
     seen = np.array(jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
     remembered = slice(policy.body_frame.measured, env.policy_observation_size)
     seen[:, remembered] = np.random.default_rng(0).uniform(-0.5, 0.5, seen[:, remembered].shape)
-    wanted = policy.to_si(np.asarray(loaded.act((), seen)[1]))
+    units = policy.memory.units if policy.memory else 0
+    assert bool(units) == (task == "any")
+    h = np.random.default_rng(1).uniform(-0.9, 0.9, (20, units))
+    after, action = loaded.act(jnp.asarray(h) if units else (), seen)
+    wanted = policy.to_si(np.asarray(action))
     assert np.ptp(wanted, axis=0).min() > 1e-4
-    np.testing.assert_allclose(policy(inputs_in_si(policy, seen)), wanted, atol=1e-6)
+    found_h, found = policy.respond(np.concatenate([inputs_in_si(policy, seen), h], axis=1))
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    if units:
+        np.testing.assert_allclose(found_h, after, atol=1e-5)
     assert qrl("export", run, *LEAST) == 0
     manifest = json.loads((run / "export" / "manifest.json").read_text())
     assert manifest["network"][0] == inputs

@@ -155,7 +155,7 @@ class TrainedRun:
             return np.ascontiguousarray(h, np.float32).view(np.int32), action
 
         starts = calibration_starts(calibration.STARTS)
-        first = np.zeros((len(starts), self.config.learner.policy_gru_size or 0), np.int32)
+        first = np.zeros((len(starts), policy.memory.units if policy.memory else 0), np.int32)
         flown = self.fly_host_policy(step, first, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
         return replace(policy, calibration=calibration.select(flown_inputs(policy, flown)))
 
