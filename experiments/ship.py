@@ -1,6 +1,6 @@
-"""Put a trained run into the package, as `RUN=NAME` then finds it: its settings, and the learner of its last checkpoint.
+"""Put a trained run into the package, where `RUN=NAME` finds it: its settings and the learner of its last checkpoint.
 
-    .venv/bin/python -m experiments.ship RUN [NAME]
+.venv/bin/python -m experiments.ship RUN [NAME]
 """
 
 import json
@@ -26,6 +26,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("run", type=Path, metavar="RUN", help="folder of a run of one seed")
     parser.add_argument("name", nargs="?", metavar="NAME", help="default: its task's")
     args = parser.parse_args(argv)
+    if not (args.name or "x").isidentifier():
+        parser.error("NAME: expected letters, digits and _")
     config = tasks.load_run_config(args.run)
     programs = FlightPrograms(tasks.environment(config.task), config.learner)
     learner, env_steps = next(programs.checkpoints(config, args.run, 1))

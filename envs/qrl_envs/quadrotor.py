@@ -53,7 +53,8 @@ class Start(NamedTuple):
     velocity_m_s: chex.Array  # world
     body_rate_rad_s: chex.Array  # body
     tilt_rad: chex.Array  # greatest tilt from upright
-    nested: chex.Array | None = None  # 1, or 0 in the place of it: each start shrinks all ranges by a factor of its own
+    # 1: each start shrinks all ranges by a factor of its own; None: none does; 0: none, where others of a batch do
+    nested: chex.Array | None = None
 
 
 def physics(vehicle: Vehicle) -> Physics:
@@ -75,8 +76,8 @@ def physics(vehicle: Vehicle) -> Physics:
 
 def start(ranges: FlightStart) -> Start:
     """The start ranges of a task file."""
-    nested = jnp.float32(1.0) if ranges.nested else None
-    return Start(*(jnp.float32(getattr(ranges, field)) for field in Start._fields[:-1]), nested)
+    values = [jnp.float32(getattr(ranges, field)) for field in Start._fields[:-1]]
+    return Start(*values, nested=jnp.float32(1.0) if ranges.nested else None)
 
 
 def thrust_N(physics: Physics, action: chex.Array) -> chex.Array:

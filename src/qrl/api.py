@@ -33,6 +33,7 @@ from qrl.cli.terminal import console
 from qrl.config import FORMER_NAMES, Config, current_names
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun, inputs_in_si
+from qrl.runs import shipped
 from qrl.runs.record import RunConfig
 from qrl_envs.specfile import BadInput, CountOrZero, nearest
 
@@ -43,8 +44,8 @@ THREADS = "PJRT_NPROC"  # XLA's number of threads, which a run with small produc
 class DeployedPolicy:
     """The deterministic policy of a run.
 
-    Called, it is NumPy in SI units: observations [..., F] -> actions [..., A]; of a recurrent policy, with a memory of
-    zeros. `apply` is a pure function in JAX with
+    Called, it is NumPy in SI units: observations [..., F] -> actions [..., A]; not of a recurrent policy, which
+    needs its memory. `apply` is a pure function in JAX with
     explicit memory, to be jitted, vmapped or differentiated; its actions are in [−1, 1], as environments take them.
     """
 
@@ -53,9 +54,9 @@ class DeployedPolicy:
         self._run = run
 
     def __call__(self, observation: ArrayLike) -> NDArray[np.float64]:
-        inputs = inputs_in_si(self._numpy, np.asarray(observation))
-        units = self._numpy.memory.units if self._numpy.memory else 0
-        return self._numpy(np.concatenate([inputs, np.zeros((*inputs.shape[:-1], units))], axis=-1))
+        if self._numpy.unit:
+            raise TypeError("a recurrent policy: expected `apply`, with the memory that `init_memory` begins with")
+        return self._numpy(inputs_in_si(self._numpy, np.asarray(observation)))
 
     def init_memory(self, *lanes: int) -> Any:
         """Memory at the start of so many flights, [*lanes, H]; () of a feed-forward policy."""
@@ -109,7 +110,7 @@ class Run:
 def load(folder: str | Path) -> Run:
     """The run of one seed in `folder`; BadInput, in one line, if there is none that can be read."""
     _configure_jax()
-    return Run(Path(folder))
+    return Run(shipped.run_folder(Path(folder)))
 
 
 def train(

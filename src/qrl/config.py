@@ -122,8 +122,8 @@ class Config(BaseModel):
     apg_split: Static[Count] = Field(
         default=1,
         exclude_if=lambda x: x == 1,
-        description="short updates, of flights as many times shorter, that each of the first APG updates is split into:"
-        " long flights teach a policy that cannot fly yet little",
+        description="each of the first APG updates (apg_split_fraction) becomes this many, on flights this many times"
+        " shorter and with full steps of Adam: long flights teach a policy that cannot fly yet little",
     )
     apg_split_fraction: Static[Fraction] = Field(
         default=0.0, exclude_if=lambda x: x == 0.0, description="first fraction of APG that is split"
@@ -131,8 +131,8 @@ class Config(BaseModel):
     apg_cotangent_norm: Traced[Positive | None] = Field(
         default=None,
         exclude_if=lambda x: x is None,  # a run of before it was there has the same fingerprint
-        description="norm at which the gradient of a flight's return with respect to its state is cut at each step;"
-        " null: none",
+        description="norm at which the gradient of a flight's return with respect to its state, its observation and the"
+        " policy's memory is cut at each step; null: none",
     )
     apg_learning_rate: Traced[Positive] = Field(description="initial step size of APG; decays to 0, as sigma then does")
 
@@ -170,6 +170,8 @@ class Config(BaseModel):
                     "expected updates_per_unroll minibatches of batch_size trajectories that make whole passes over"
                     f" num_envs = {self.num_envs} with sampling epochs"
                 )
+        if self.policy_gru_size and not self.policy_hidden_layer_sizes:
+            raise ValueError("expected policy_hidden_layer_sizes of at least one layer with policy_gru_size")
         if self.policy_gru_size and self.symmetries:
             raise ValueError("expected symmetries false with policy_gru_size: a stored memory cannot be transformed")
         if self.apg_episode_length % self.apg_split:

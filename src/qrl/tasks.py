@@ -209,6 +209,8 @@ def _carried_over(values: dict[str, Any], task: task_spec.Task) -> dict[str, Any
     rate = PRESET_PERIOD_S[task.world] / task.control_period_s
     steps = ("num_timesteps", "episode_length", "unroll_length", "apg_episode_length")
     values = values | {name: max(1, round(values[name] * rate)) for name in steps if values[name]}
+    if parts := values.get("apg_split", 1):
+        values["apg_episode_length"] = parts * max(1, round(values["apg_episode_length"] / parts))
     values["gamma"] = float(values["gamma"]) ** (1.0 / rate)
     if isinstance(task, task_spec.QuadrotorTask) and task.distribution is None:
         slower = task.vehicle.recovery_s / PRESET_RECOVERY_S

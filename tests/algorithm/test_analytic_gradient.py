@@ -18,7 +18,6 @@ from bound_learner import BoundLearner
 from fault_injection import assert_same_leaves, leaves
 from qrl import tasks
 from qrl.algorithm import analytic_gradient
-from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerState
 from qrl.config import Config, load_preset, preset_names
 from qrl.runs import checkpoint, files
@@ -480,27 +479,36 @@ def test_the_gradient_with_respect_to_a_state_is_cut(limit: float) -> None:
     assert ours == pytest.approx(expected, rel=1e-4)
 
 
-def test_the_first_updates_are_split_into_shorter_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As many as the fraction says, each with flights, keys and a progress of its own; the steps are the same."""
-    config = run_config(**WITH_APG, apg_split=4, apg_split_fraction=0.4).learner
-    assert config.num_apg_updates == 6
-    seen = []
+def test_the_first_updates_are_split_into_shorter_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many as the fraction says, rounded up, each with a key, a progress and flights of its own.
 
-    def update(*args: Any) -> TrainState:
-        _, _, key, progress, length, state = args
-        seen.append((key.tolist(), float(progress), length))
-        return state
+    A run that is stopped among them, or between them and the rest, goes on to the same bits.
+    """
+    split = {**WITH_APG, "apg_split": 4, "apg_split_fraction": 0.4}
+    env, run, seen = small_run.pendulum(), run_config(**split), []
+    config = run.learner
+    original = trainer._apg_update
+
+    def update(setup: Any, inputs: Any, key: Any, progress: Any, length: int, state: TrainState) -> TrainState:
+        jax.debug.callback(lambda k, p: seen.append((p.item(), length, *k.tolist())), key, progress)
+        return original(setup, inputs, key, progress, length, state)
 
     monkeypatch.setattr(trainer, "_apg_update", update)
-    env = adapt(small_run.pendulum())
-    state = type("", (), {"learning_unrolls": jnp.int32(config.learning_unrolls), "key": jax.random.PRNGKey(0)})()
-    with jax.disable_jit():
-        for step in range(6):
-            monkeypatch.setattr(jax.lax, "fori_loop", lambda low, high, body, x: [body(i, x) for i in range(high)][-1])
-            trainer.apg_step(trainer.Setup(env, config), None, jnp.int32(step), state)  # pyright: ignore
-    assert [length for *_, length in seen] == [5] * 12 + [20] * 3
-    progress = [p for _, p, _ in seen]
-    np.testing.assert_allclose(progress, [*np.arange(12) / 24, 0.5, 4 / 6, 5 / 6], rtol=1e-6)
-    assert len({tuple(key) for key, *_ in seen}) == 15
+    (tmp_path / "whole").mkdir()
+    train(tmp_path / "whole", run, env)
+    jax.effects_barrier()
+    assert (config.num_apg_updates, int(trainer.split_apg_updates(config, config.learning_unrolls))) == (6, 3)
+    assert [length for _, length, *_ in seen] == [5] * 12 + [20] * 3
+    np.testing.assert_allclose([p for p, *_ in seen], [*np.arange(12) / 24, 3 / 6, 4 / 6, 5 / 6], rtol=1e-6)
+    assert len({tuple(key) for *_, key in ((p, n, k) for p, n, *k in seen)}) == 15
+    for stop_after in (19, 23):
+        folder = tmp_path / str(stop_after)
+        folder.mkdir()
+        train(folder, run, env, stop_after=stop_after)
+        train(folder, run, env, resume=True)
+        assert_same_leaves(leaves(folder), leaves(tmp_path / "whole"))
+
+
+def test_what_cannot_be_split_is_refused() -> None:
     with pytest.raises(ValidationError, match="expected apg_episode_length to be a multiple of apg_split = 3"):
         run_config(**WITH_APG, apg_split=3)

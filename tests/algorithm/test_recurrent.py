@@ -1,6 +1,7 @@
 """A recurrent policy: its cell, whole trajectories from their first memory, and its gradients."""
 
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import flax.linen as nn
@@ -11,11 +12,14 @@ import pytest
 from brax.envs.base import Env, State
 from pydantic import ValidationError
 
+import small_run
+from fault_injection import assert_same_leaves, leaves
 from qrl.algorithm import analytic_gradient, learner, networks, rollout
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerSpec
 from qrl.algorithm.networks import GRU
 from qrl.config import Config
+from small_run import run_config, train
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
@@ -174,3 +178,23 @@ def test_the_gradient_of_flights_goes_through_the_memory() -> None:
 def test_a_memory_cannot_be_mirrored() -> None:
     with pytest.raises(ValidationError, match="expected symmetries false with policy_gru_size"):
         config(symmetries=True)
+
+
+def test_a_recurrent_unit_follows_a_hidden_layer() -> None:
+    with pytest.raises(ValidationError, match="at least one layer with policy_gru_size"):
+        config(policy_hidden_layer_sizes=())
+
+
+def test_stopped_it_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    """Through both learners."""
+    run = run_config(
+        policy_gru_size=3, policy_hidden_layer_sizes=(4,), symmetries=False, apg_fraction=0.4, apg_num_envs=4
+    )
+    env = small_run.pendulum()
+    for name in ("whole", "stopped"):
+        (tmp_path / name).mkdir()
+    train(tmp_path / "whole", run, env)
+    for stop_after in (7, 21):
+        train(tmp_path / "stopped", run, env, stop_after=stop_after, resume=stop_after > 7)
+    train(tmp_path / "stopped", run, env, resume=True)
+    assert_same_leaves(leaves(tmp_path / "stopped"), leaves(tmp_path / "whole"))

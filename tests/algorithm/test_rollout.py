@@ -106,7 +106,14 @@ def unroll_of(env: Env) -> Callable[..., tuple[Lanes, Transition]]:
     sigma = jnp.float32(SIGMA)
     return jax.jit(
         lambda lanes, key, starts: rollout.unroll(
-            adapt(env), lanes, lambda memory, o: (memory, mean(o)), sigma, key, starts, unroll_length=T, max_episode_steps=LONGEST
+            adapt(env),
+            lanes,
+            lambda memory, o: (memory, mean(o)),
+            sigma,
+            key,
+            starts,
+            unroll_length=T,
+            max_episode_steps=LONGEST,
         )
     )
 
@@ -364,7 +371,14 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
         begun = rollout.init(adapt(env), key, jnp.arange(lanes), lanes, LONGEST, T)
         mean, sigma = (lambda observation: jnp.zeros((*observation.shape[:-1], env.action_size))), jnp.float32(0.5)
         after, steps = rollout.unroll(
-            adapt(env), begun, lambda memory, o: (memory, mean(o)), sigma, key, key, unroll_length=3 * T, max_episode_steps=LONGEST
+            adapt(env),
+            begun,
+            lambda memory, o: (memory, mean(o)),
+            sigma,
+            key,
+            key,
+            unroll_length=3 * T,
+            max_episode_steps=LONGEST,
         )
         return steps, after.state, after.steps, after.done, after.reset_count + after.next_state_used, after.num_early
 
@@ -387,7 +401,14 @@ def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
     def run(key: jax.Array) -> tuple[Lanes, Transition]:
         lanes = rollout.init(adapt(env), key, jnp.arange(4), 4, 100, 50)
         return lanes, rollout.unroll(
-            adapt(env), lanes, lambda memory, o: (memory, still(o)), sigma, key, key, unroll_length=50, max_episode_steps=100
+            adapt(env),
+            lanes,
+            lambda memory, o: (memory, still(o)),
+            sigma,
+            key,
+            key,
+            unroll_length=50,
+            max_episode_steps=100,
         )[1]
 
     lanes, steps = run(jax.random.key(0))

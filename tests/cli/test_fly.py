@@ -24,17 +24,19 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_run_that_ships_is_copied_once(package: Path) -> None:
-    """What is made of the copy stays, until another version of the run ships."""
+    """What is made of the copy stays; another version has a copy of its own."""
     copy = shipped.run_folder(Path("any"))
-    assert copy == Path("runs/shipped/any")
+    assert copy.parent == Path("runs/shipped")
     assert (copy / "checkpoints/100/manifest.json").read_text() == "one"
     (copy / "view.html").touch()
     assert shipped.run_folder(Path("any")) == copy
     assert (copy / "view.html").exists()
     (package / "checkpoints/100/manifest.json").write_text("two")
-    assert shipped.run_folder(Path("any")) == copy
-    assert (copy / "checkpoints/100/manifest.json").read_text() == "two"
-    assert [path.name for path in copy.parent.iterdir()] == ["any"]
+    other = shipped.run_folder(Path("any"))
+    assert other != copy
+    assert (other / "checkpoints/100/manifest.json").read_text() == "two"
+    assert (copy / "view.html").exists()
+    assert sorted(copy.parent.iterdir()) == sorted([copy, other])
 
 
 @pytest.mark.usefixtures("package")

@@ -238,6 +238,21 @@ def test_integers_are_close_to_float(which: str, activation: str) -> None:
     assert np.abs(error).max() <= 0.03
 
 
+def test_a_candidate_beyond_the_tanhs_range_is_close_to_float() -> None:
+    """Of sums many times as large, of which r leaves a part: they are not cut before it does."""
+    policy = policies.remembering("recurrent")
+    assert policy.unit
+    weight, bias = policy.unit.of_memory
+    policy = replace(policy, unit=replace(policy.unit, of_memory=(6.0 * weight, 6.0 * bias)))
+    kernel = quantize(policy)
+    assert kernel.unit
+    assert kernel.unit.shift > 0
+    low, high = policy.limits
+    error = (respond(kernel, policy.calibration) - policy(policy.calibration.astype(float))) / (high - low)
+    assert (error**2).mean() ** 0.5 <= 0.006
+    assert np.abs(error).max() <= 0.05
+
+
 def remembered(kernel: Kernel, state: np.ndarray) -> np.ndarray:
     """The state in SI units."""
     assert kernel.memory
@@ -531,11 +546,35 @@ FRAME_FAULTS = {  # of a policy in the body frame, with heading, previews and th
 }
 
 
+UNIT_FAULTS = {  # of a recurrent policy
+    "no reset": ("        state->recurrent[i] = 0;\n", "        (void)state;\n"),
+    "r and z swapped": (
+        "sigmoid(gates->one[i]), z = sigmoid(gates->one[UNITS + i])",
+        "sigmoid(gates->one[UNITS + i]), z = sigmoid(gates->one[i])",
+    ),
+    "h before its product": (
+        "    dense(l, a->one, gates);\n",
+        "    dense(l, a->one, gates);\n    after[0] = (activation)(after[0] + 9);\n",
+    ),
+    "no sigmoid": ("+ 32768) >> 1", "+ 32767) >> 1"),
+    "a tile too far": (
+        "activation *const after = a->one + UNIT_INPUTS",
+        "activation *const after = a->one + UNIT_INPUTS + 4",
+    ),
+    "no candidate shift": ("* (1 << CANDIDATE_SHIFT)", "* (2 << CANDIDATE_SHIFT)"),
+    "h is not kept": ("        h[i] = (int16_t)(n +", "        gates->one[i] = (activation)(n +"),
+}
+
+
 @pytest.mark.usefixtures("host")
 @pytest.mark.parametrize(
     ("which", "fault"),
-    [*(("both", each) for each in SOURCE_FAULTS.values()), *(("track", each) for each in FRAME_FAULTS.values())],
-    ids=[*SOURCE_FAULTS, *FRAME_FAULTS],
+    [
+        *(("both", each) for each in SOURCE_FAULTS.values()),
+        *(("track", each) for each in FRAME_FAULTS.values()),
+        *(("recurrent", each) for each in UNIT_FAULTS.values()),
+    ],
+    ids=[*SOURCE_FAULTS, *FRAME_FAULTS, *UNIT_FAULTS],
 )
 def test_a_slip_in_the_source_shows(which: str, fault: tuple[str, str], tmp_path: Path) -> None:
     source = policies.emitted(tmp_path, policies.remembering(which), policies.remembering_kernel(which))
@@ -550,16 +589,18 @@ def test_a_slip_in_the_source_shows(which: str, fault: tuple[str, str], tmp_path
 
 @pytest.mark.usefixtures("host")
 @pytest.mark.parametrize(
-    ("fault", "by"), [("golden_integral", 1), ("act_first", 2000), ("errors", 1), ("positions", 1)]
+    ("fault", "by"),
+    [("golden_integral", 1), ("act_first", 2000), ("errors", 1), ("positions", 1), ("golden_recurrent", 1)],
 )
 def test_the_self_test_sees_the_memory(fault: str, by: int, tmp_path: Path) -> None:
-    source = policies.emitted(tmp_path, policies.remembering(), policies.remembering_kernel())
+    which = "recurrent" if fault == "golden_recurrent" else "both"
+    source = policies.emitted(tmp_path, policies.remembering(which), policies.remembering_kernel(which))
     text = source.read_text()
     at = text.index("= {", text.index(f" {fault}[")) + 3
     first = next(number for number in text[at:].replace("{", " ").replace(",", " ").split())
     start = text.index(first, at)
     source.write_text(text[:start] + str(int(first) + by) + text[start + len(first) :])
-    wanted = drawn("both", "relu", FEW)
+    wanted = drawn(which, "relu", FEW)
     assert targets.run_host(source, tmp_path, ("-O0",), wanted.observations).selftest > 0
 
 

@@ -37,7 +37,7 @@ def literal_network(kernel: Kernel, x: list[int], h: list[int]) -> tuple[list[in
         given, own = literal_dense(unit.of_input, x), literal_dense(unit.of_memory, h)
         after = []
         for r, z, now, of_x, of_h in zip(gates[: len(h)], gates[len(h) :], h, given, own, strict=True):
-            n = literal_tanh(limited(of_x + (r * of_h + 2**14) // 2**15, -(2**15), 2**15 - 1))
+            n = literal_tanh(limited((of_x + (r * of_h + 2**14) // 2**15) * 2**unit.shift, -(2**15), 2**15 - 1))
             after.append(n + ((now - n) * z + 2**14) // 2**15)
         x = h = after
     y = literal_dense(kernel.layers[-1], x)

@@ -58,11 +58,11 @@ def returns(
     """For each of `keys` [n] a flight of `steps` from a fresh start: sum of its rewards, and whether it is complete.
 
     Actions are clip(mean + sigma·noise, −1, 1), where policy(memory, observation) gives the next memory and the mean;
-    `memory` is that of the first step. A flight that ends early is not complete. It is held where
-    it ended, since what overflows has no gradient, and is charged for the steps that are left: the last reward each, or
-    0 if that was above 0 and the flight was not out of bounds. So ending never pays. With `cotangent_norm` the gradient
-    of a flight's return with respect to its state and the policy's memory after any step is cut to that norm: long flights of a lagged vehicle
-    are chaotic, and a few of them would drown all others.
+    `memory` is that of the first step. A flight that ends early is not complete. It is held where it ended, since what
+    overflows has no gradient, and is charged for the steps that are left: the last reward each, or 0 if that was above
+    0 and the flight was not out of bounds. So ending never pays. With `cotangent_norm` the gradient of a flight's
+    return with respect to its state, its observation and the policy's memory after any step is cut to that norm: long
+    flights of a lagged vehicle are chaotic, and a few of them would drown all others.
     """
     env = adapt(env)
 

@@ -1,7 +1,8 @@
 """Device-resident ring buffer of unrolls.
 
-A slot holds one unroll of all lanes; a full buffer overwrites its oldest slot. `inserted` must stay unbatched where
-members are vmapped: a batched cursor turns the slice update into a scatter.
+A slot holds one unroll of all lanes, leaves [N, T, ...], and the memory that they began it with, [N, ...]; a full
+buffer overwrites its oldest slot. `inserted` must stay unbatched where members are vmapped: a batched cursor turns the
+slice update into a scatter.
 """
 
 from typing import NamedTuple
@@ -17,12 +18,12 @@ class ReplayBuffer(NamedTuple):
 
 
 def create(unroll: chex.ArrayTree, slots: int) -> ReplayBuffer:
-    """An empty buffer for unrolls like `unroll` (leaves [N, T, ...], arrays or shape structs)."""
+    """An empty buffer for unrolls like `unroll` (arrays or shape structs)."""
     return ReplayBuffer(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), unroll), jnp.int32(0))
 
 
 def add(buffer: ReplayBuffer, unroll: chex.ArrayTree) -> ReplayBuffer:
-    """Write `unroll` (leaves [N, T, ...]) into the next slot."""
+    """Write `unroll` into the next slot."""
     slots = jax.tree.leaves(buffer.data)[0].shape[0]
     slot = buffer.inserted % slots
     data = jax.tree.map(

@@ -101,7 +101,7 @@ def unroll(
     max_episode_steps: int,
 ) -> tuple[Lanes, Transition]:
     """T steps of every lane under mu = N(mean, sigma²·I), where policy(memory, observation) gives the next memory and
-    the mean; transitions with leaves [N, T, ...].
+    the mean; transitions with leaves [N, T, ...], but for the memory [N, H].
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last step is
     `truncated` where it reached `max_episode_steps` or where the environment's `info` says so ("truncation",

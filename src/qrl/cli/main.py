@@ -98,13 +98,15 @@ def build_parser() -> _Parser:
     fly = commands.add_parser("fly", help="fly a policy of any vehicle with yours: evaluate and view")
     for command in (evaluate, export, view):
         command.add_argument("run", type=Path, metavar="RUN", help="run folder, or the name of a run that ships: any")
-    fly.add_argument("run", nargs="?", type=Path, default=Path("any"), metavar="RUN", help="as of evaluate (any)")
+    fly.add_argument(
+        "run", nargs="?", type=Path, default=Path("any"), metavar="RUN", help="run folder, or a run that ships (any)"
+    )
     fly.add_argument("--starts", type=count, default=200, metavar="N", help="number of starts (default 200)")
     for command in (evaluate, view, fly):
         instead = f"{figure}, in place of the task's own"
         command.add_argument("--reference", metavar="REFERENCE", help=instead)
         other = "of a policy of any vehicle: a shipped vehicle's name or a .json file"
-        command.add_argument("--vehicle", metavar="VEHICLE", help=other)
+        command.add_argument("--vehicle", metavar="VEHICLE", help=other, required=command is fly)
     for command in (evaluate, export):
         command.add_argument("--starts", type=count, default=1000, metavar="N", help="number of starts (default 1000)")
     conditions = "also fly with other lag, latency, mass, thrust, wind, gusts, sensors and control rate"
@@ -262,6 +264,8 @@ def _run(args: argparse.Namespace) -> int:
     try:
         if getattr(args, "run", None):
             args.run = shipped.run_folder(args.run)
+        if getattr(args, "beside", None):
+            args.beside = [shipped.run_folder(folder) for folder in args.beside]
         return _command(args.command)(args)
     except BadInput as error:  # raised on every process
         print_error(str(error))

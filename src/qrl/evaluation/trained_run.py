@@ -23,7 +23,17 @@ from qrl.algorithm.types import Env, State
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import calibration_starts
-from qrl.export.policy import ActionSpec, BodyFrame, GatedUnit, Integral, Layer, Memory, ObservationSpec, Policy, Provenance
+from qrl.export.policy import (
+    ActionSpec,
+    BodyFrame,
+    GatedUnit,
+    Integral,
+    Layer,
+    Memory,
+    ObservationSpec,
+    Policy,
+    Provenance,
+)
 from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
@@ -167,7 +177,8 @@ class TrainedRun:
         see, if anything.
         """
         config, deployed = self.config.learner, self._programs.deployed(self._learner)
-        memory = memory or self._memory(config.policy_gru_size or 0)
+        units = config.policy_gru_size or 0
+        memory = replace(memory, units=units) if memory else self._memory(units)
         layers, unit = _layers(deployed.params.policy["params"], recurrent=bool(config.policy_gru_size))
         view = getattr(self.env, "body_view", None)
         body_frame = BodyFrame(*view) if view else None

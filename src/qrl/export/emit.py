@@ -201,7 +201,7 @@ def _state(kernel: Kernel) -> tuple[str, str]:
     if units := kernel.memory.units:
         fields.append(f"    int16_t recurrent[{units}]; /* of the network's recurrent unit, in 1 / 32767 */")
         words.append("the numbers of the network's recurrent unit")
-    return "\n".join(fields), " and ".join(words)
+    return "\n".join(fields), " and ".join(filter(None, [", ".join(words[:-1]), words[-1]]))
 
 
 def _comment_safe(text: str) -> str:
@@ -275,7 +275,9 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         if memory.integral:
             parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
     if units := kernel.memory.units if kernel.memory else 0:
-        parts.append(f"#define UNIT_LAYER {len(kernel.layers) - 1}\n#define UNIT_INPUTS {_padded(kernel.widths[-3])}")
+        numbers = {"UNIT_LAYER": len(kernel.layers) - 1, "UNIT_INPUTS": _padded(kernel.widths[-3])}
+        numbers |= {"CANDIDATE_SHIFT": kernel.unit.shift if kernel.unit else 0}
+        parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
         last = np.ascontiguousarray(golden.outputs.state[embedded(kernel) - 1, -2 * units :]).view("<i2")
         parts.append(_array("int16_t golden_recurrent[UNITS]", last, 12))
     if turn := kernel.turn:

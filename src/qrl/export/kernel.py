@@ -84,13 +84,14 @@ class Memory:
 class GatedUnit:
     """A gated recurrent unit (`policy.GatedUnit`) of inputs x and h, in 1/32767.
 
-    r and z are (table + 32768) >> 1 of the tanh of half of what they are given, n the tanh of of_input + ⌊r·of_memory /
-    2¹⁵⌉, saturated; the next h is n + ⌊(h − n)·z / 2¹⁵⌉.
+    r and z are (t + 32768) >> 1, t the tanh of what `gates` gives, which is half of their sum; n is the tanh of
+    (of_input + ⌊r·of_memory / 2¹⁵⌉)·2^shift, saturated, as each layer's output is; the next h is n + ⌊(h − n)·z / 2¹⁵⌉.
     """
 
     gates: Dense  # of x and h
     of_input: Dense
     of_memory: Dense
+    shift: int = 0  # in [0, 8]: these two are sums in steps 2^shift as coarse as the tanh's
 
     @property
     def units(self) -> int:
@@ -248,6 +249,8 @@ def _check_fields(kernel: Kernel) -> None:
                     ("the circle's radius", circle.factor, 2**14, INT16),
                     ("the circle's radius", circle.shift, 1, 30),
                 ]
+    if kernel.unit:
+        ranges.append(("the recurrent unit's shift", np.array(kernel.unit.shift), 0, 8))
     for layer in kernel.products:
         ranges += [
             ("a weight", layer.weight, -127, 127),
@@ -307,7 +310,7 @@ def remember(unit: GatedUnit, x: Ints, h: Ints) -> Ints:
     low = -INT16 - 1
     r, z = np.split(_tanh(dense(unit.gates, np.concatenate([x, h], axis=-1), low)) + INT16 + 1 >> 1, 2, axis=-1)
     given = dense(unit.of_input, x, low) + shifted(r * dense(unit.of_memory, h, low), 15)
-    n = _tanh(np.clip(given, low, INT16))
+    n = _tanh(np.clip(given << unit.shift, low, INT16))
     return n + shifted((h - n) * z, 15)
 
 

@@ -8,7 +8,7 @@ Four measures keep int8 weights close to the float policy:
 - weights are rounded one by one, and each rounding error is compensated by the remaining weights (Frantar et al. 2022,
   "GPTQ");
 - all errors are weighted by the action's sensitivity to the layer's output, sample by sample (a diagonal Fisher
-  information).
+  information); of a recurrent unit that is the action of the same step, not of later ones.
 """
 
 from dataclasses import astuple, replace
@@ -146,20 +146,24 @@ def _gated_unit(
     h = np.round(h_float * INT16).astype(np.int64)
     of_h = np.full(h.shape[1], 1.0 / INT16)
     steps, given = (np.concatenate([step, of_h]), step, of_h), (np.concatenate([x, h], axis=1), x, h)
+    sums = unit.sums(x_float, h_float)
+    # r scales one of the candidate's two sums after both were saturated: they need more than the tanh's range.
+    largest = ACTIVATION_MARGIN * max(float(np.abs(part).max()) for part in sums[1:])
+    shift = int(np.clip(np.ceil(np.log2(largest / TANH_RANGE)), 0, 8))
     tanh_step = TANH_RANGE / (INT16 + 1)
     found = [
         _dense(weight * lsb[:, None], target, q, slope, np.full(len(bias), factor * tanh_step), ridge)
         for (weight, bias), target, lsb, q, slope, factor in zip(
             (unit.gates, unit.of_input, unit.of_memory),
-            unit.sums(x_float, h_float),
+            sums,
             steps,
             given,
             sensitivity,
-            (2.0, 1.0, 1.0),  # a gate is a tanh of half of its sum
+            (2.0, 2.0**shift, 2.0**shift),  # a gate is a tanh of half of its sum
             strict=True,
         )
     ]
-    made = integers.GatedUnit(*found)
+    made = integers.GatedUnit(*found, shift=shift)
     return made, integers.remember(made, x, h)
 
 
@@ -380,7 +384,10 @@ def _sensitivity(policy: Policy, layers: list[Layer], x: Floats, h: Floats) -> t
     of_unit: list[Floats] = []
     if unit := policy.unit:
         gates, of_input, of_memory = unit.sums(x, h)
-        (r, z), n = np.split(sigmoid(gates), 2, axis=-1), np.tanh(of_input + sigmoid(gates)[:, : h.shape[1]] * of_memory)
+        (r, z), n = (
+            np.split(sigmoid(gates), 2, axis=-1),
+            np.tanh(of_input + sigmoid(gates)[:, : h.shape[1]] * of_memory),
+        )
         of_candidate = (1.0 - z) * (1.0 - n**2)
         by_sums = [
             (

@@ -1,7 +1,9 @@
 """Trained runs that ship with the package: run folders with the learner of their last checkpoint."""
 
+import hashlib
 import shutil
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 SHIPPED = Path(__file__).parents[1] / "policies"
@@ -13,24 +15,23 @@ def names() -> list[str]:
 
 
 def run_folder(run: Path) -> Path:
-    """`run`; or, where there is no such folder and it is the name of a shipped run, a copy of that in runs/shipped: what
-    is made of a run is written to its folder.
+    """`run`; or, where there is no such folder and it is the name of a shipped run, a copy of that in runs/shipped.
+
+    For what is made of a run is written to its folder. The copy's name ends in a version: no other one replaces it.
     """
     if run.exists() or str(run) not in names():
         return run
-    source, copy = SHIPPED / run.name, COPIES / run.name
-    if (copy / "config.json").is_file() and _contents(copy) >= _contents(source):
+    source = SHIPPED / run.name
+    copy = COPIES / f"{run.name}-{_version(source)}"
+    if copy.is_dir():
         return copy
     COPIES.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=COPIES, prefix=".copy-") as work:
-        made = shutil.copytree(source, Path(work) / run.name)
-        if copy.exists():
-            copy.replace(Path(work) / "former")
-        made.replace(copy)
+    with tempfile.TemporaryDirectory(dir=COPIES, prefix=".copy-") as work, suppress(OSError):
+        shutil.copytree(source, Path(work) / run.name).rename(copy)  # unless another process was first
     return copy
 
 
-def _contents(folder: Path) -> set[tuple[str, bytes]]:
-    """The settings and the checkpoints' manifests of a run."""
-    files = [folder / "config.json", *folder.glob("checkpoints/*/manifest.json")]
-    return {(str(path.relative_to(folder)), path.read_bytes()) for path in files}
+def _version(folder: Path) -> str:
+    """Eight digits that say which run it is: of the digest of its settings and its checkpoints' manifests."""
+    files = sorted([folder / "config.json", *folder.glob("checkpoints/*/manifest.json")])
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:8]

@@ -199,16 +199,14 @@ def _first_fault(collected: chex.Array, metrics: chex.Array, updates: chex.Array
     return jnp.where(ok, -1, updates + update), jnp.where(ok, -1, term)
 
 
-def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainState) -> TrainState:
-    """APG update number `step` (int32 []), or as many shorter ones as it is split into; the counter of unrolls is left
-    to the caller.
+def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainState, parts: int = 1) -> TrainState:
+    """APG update number `step` (int32 []), or in its place so many `parts`, updates of flights as many times shorter;
+    the counter of unrolls is left to the caller.
     """
     config = setup.config
     updates = (config.num_unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
     key = jax.random.fold_in(state.key, state.learning_unrolls + step)
-    parts = config.apg_split
-
-    def whole(state: TrainState) -> TrainState:
+    if parts == 1:
         return _apg_update(setup, inputs, key, step / jnp.maximum(1, updates), config.apg_episode_length, state)
 
     def part(i: chex.Array, state: TrainState) -> TrainState:
@@ -216,10 +214,13 @@ def apg_step(setup: Setup, inputs: MemberInputs, step: chex.Array, state: TrainS
         length = config.apg_episode_length // parts
         return _apg_update(setup, inputs, jax.random.fold_in(key, i), progress, length, state)
 
-    if parts == 1:
-        return whole(state)
-    is_split = step < updates * config.apg_split_fraction
-    return jax.lax.cond(is_split, lambda state: jax.lax.fori_loop(0, parts, part, state), whole, state)
+    return jax.lax.fori_loop(0, parts, part, state)
+
+
+def split_apg_updates(config: Config, learning_unrolls: chex.Array) -> chex.Array:
+    """How many APG updates are split, the first ones; int32 []."""
+    updates = (config.num_unrolls - learning_unrolls) // config.unrolls_per_apg_update
+    return jnp.ceil(updates * config.apg_split_fraction).astype(jnp.int32)
 
 
 def _apg_update(
@@ -308,8 +309,13 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
         def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
             first = (state.unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
             count = (until - state.unrolls) // config.unrolls_per_apg_update
+            split = jnp.int32(0)
+            if config.apg_split > 1 and config.apg_split_fraction:  # two loops: a condition would run both under vmap
+                split = jnp.clip(split_apg_updates(config, state.learning_unrolls) - first, 0, count)
+                parts = lambda i, now: apg_step(setup, inputs, first + i, now, config.apg_split)  # noqa: E731
+                state = jax.lax.fori_loop(0, split, parts, state)
             step = lambda i, now: apg_step(setup, inputs, first + i, now)  # noqa: E731
-            return jax.lax.fori_loop(0, count, step, state)._replace(unrolls=until)
+            return jax.lax.fori_loop(split, count, step, state)._replace(unrolls=until)
 
         # Not a member that has just been brought to `until`, where its APG begins.
         active = (states.unrolls >= states.learning_unrolls) & (states.unrolls < until)

@@ -81,7 +81,7 @@ struct layer {
     const factors *of_rows; /* below 2^15 */
     uint16_t inputs;             /* inputs and outputs are multiples of 4, padded with zeros */
     uint16_t outputs;
-    uint8_t hidden;              /* 0: the last layer, without activation */
+    uint8_t hidden;              /* 1: the activation follows */
     uint8_t shift;
 };
 
@@ -345,26 +345,27 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 #if UNITS
 
-/* A sigmoid in 1 / 2^15, of what a layer gives for half of its input. */
-static inline int32_t gate(activation given) {
+/* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
+static inline int32_t sigmoid(activation given) {
     return (tanh_of((int32_t)given - OFFSET) + 32768) >> 1;
 }
 
-/* A gated recurrent unit of three layers: inputs in `a`, then in their place its numbers h.
-   r, z = sigmoid(gates of x and h), n = tanh(of x + r * of h), h = n + (h - n) * z */
-static void remember(const struct layer *l, union activations *a, int16_t h[UNITS]) {
-    union activations gates, of_input, of_memory;
+/* A gated recurrent unit of three layers: inputs in `a`, then in their place its numbers h; `gates` is overwritten.
+   r, z = sigmoid(gates of x and h), n = tanh((of x + r * of h) * 2^shift), h = n + (h - n) * z */
+static void remember(const struct layer *l, union activations *a, union activations *gates, int16_t h[UNITS]) {
+    union activations of_input, of_memory;
     activation *const after = a->one + UNIT_INPUTS;
     for (int i = 0; i < (UNITS + 3) / 4 * 4; ++i) {
         after[i] = (activation)((i < UNITS ? h[i] : 0) + OFFSET);
     }
-    dense(l, a->one, &gates);
+    dense(l, a->one, gates);
     dense(l + 1, a->one, &of_input);
     dense(l + 2, after, &of_memory);
     for (int i = 0; i < UNITS; ++i) {
-        const int32_t r = gate(gates.one[i]), z = gate(gates.one[UNITS + i]);
+        const int32_t r = sigmoid(gates->one[i]), z = sigmoid(gates->one[UNITS + i]);
         const int32_t more = shifted(r * ((int32_t)of_memory.one[i] - OFFSET), 15);
-        const int32_t n = tanh_of(limited((int32_t)of_input.one[i] - OFFSET + more, -32768, 32767));
+        const int32_t sum = ((int32_t)of_input.one[i] - OFFSET + more) * (1 << CANDIDATE_SHIFT);
+        const int32_t n = tanh_of(limited(sum, -32768, 32767));
         h[i] = (int16_t)(n + shifted((h[i] - n) * z, 15));
     }
     for (int i = 0; i < (UNITS + 3) / 4 * 4; ++i) {
@@ -379,7 +380,7 @@ static const activation *network(union activations *a, union activations *b, @na
     for (const struct layer *l = layers; l != layers + LAYERS; ++l) {
 #if UNITS
         if (l == layers + UNIT_LAYER) {
-            remember(l, a, state->recurrent);
+            remember(l, a, b, state->recurrent);
             l += 3;
         }
 #endif
