@@ -25,12 +25,14 @@ from qrl.export.policy import Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, respond
 from qrl.export.report import FlightStats, Measured, gates, report
 from qrl.export.verify import VerificationReport, verify
+from qrl.training import devices
 from qrl_envs.specfile import BadInput
 
 
 def export(args: argparse.Namespace) -> int:
     """Write RUN/export; print verification, gates and costs."""
     start_time = time.perf_counter()
+    devices.configure_callbacks()
     run = TrainedRun.load(args.run)
     name = kernel_name(run, args.name)
     measured = export_run(run, args.starts, args.vectors, console.print, name)

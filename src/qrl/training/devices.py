@@ -42,6 +42,15 @@ def configure_cpu(run: RunConfig, before: Sequence[str], environment: MutableMap
         environment["PJRT_NPROC"] = "1"  # the threads of so small a product would mostly wait
 
 
+def configure_callbacks(environment: MutableMapping[str, str] = os.environ) -> None:
+    """Give XLA two threads at least: with one, a program that calls Python waits for ever for what it is to hand over,
+    where that is 100 KB or more. To be called before JAX initializes its devices.
+    """
+    given = next((environment[name] for name in THREADS if name in environment), str(_cores()))
+    if given == "1":
+        environment["PJRT_NPROC"] = "2"
+
+
 def cpu_devices(learner: Config, seeds: int, cores: int) -> int:
     """Number of devices for a run on `cores`: each has a member of its own, or enough of one's work."""
     for count in range(cores, 1, -1):
