@@ -549,20 +549,14 @@ FRAME_FAULTS = {  # of a policy in the body frame, with heading, previews and th
 UNIT_FAULTS = {  # of a recurrent policy
     "no reset": ("        state->recurrent[i] = 0;\n", "        (void)state;\n"),
     "r and z swapped": (
-        "sigmoid(gates->one[i]), z = sigmoid(gates->one[UNITS + i])",
-        "sigmoid(gates->one[UNITS + i]), z = sigmoid(gates->one[i])",
-    ),
-    "h before its product": (
-        "    dense(l, a->one, gates);\n",
-        "    dense(l, a->one, gates);\n    after[0] = (activation)(after[0] + 9);\n",
+        "r = sigmoid(ik[0], mk[0]), z = sigmoid(ik[UNITS], mk[UNITS])",
+        "z = sigmoid(ik[0], mk[0]), r = sigmoid(ik[UNITS], mk[UNITS])",
     ),
     "no sigmoid": ("+ 32768) >> 1", "+ 32767) >> 1"),
-    "a tile too far": (
-        "activation *const after = a->one + UNIT_INPUTS",
-        "activation *const after = a->one + UNIT_INPUTS + 4",
-    ),
-    "no candidate shift": ("* (1 << CANDIDATE_SHIFT)", "* (2 << CANDIDATE_SHIFT)"),
-    "h is not kept": ("        h[i] = (int16_t)(n +", "        gates->one[i] = (activation)(n +"),
+    "the gates' shift": ("OFFSET, GATE_SHIFT)", "OFFSET, GATE_SHIFT + 1)"),
+    "the candidate's shift": ("more, CANDIDATE_SHIFT)", "more, CANDIDATE_SHIFT + 1)"),
+    "h is not kept": ("        h[k] = (int16_t)(n +", "        a->one[k] = (activation)(n +"),
+    "the inputs for h": ("dense(l + 1, a->one, &m)", "dense(l + 1, i->one, &m)"),
 }
 
 

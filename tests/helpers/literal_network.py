@@ -33,12 +33,16 @@ def literal_network(kernel: Kernel, x: list[int], h: list[int]) -> tuple[list[in
         relu = kernel.activation == "relu"
         x = [max(z, 0) if relu else literal_tanh(z) for z in literal_dense(layer, x)]
     if unit := kernel.unit:
-        gates = [(literal_tanh(z) + 32768) // 2 for z in literal_dense(unit.gates, x + h)]
-        given, own = literal_dense(unit.of_input, x), literal_dense(unit.of_memory, h)
+        i, m, units = literal_dense(unit.of_input, x), literal_dense(unit.of_memory, h), len(h)
+
+        def tanh(total: int, shift: int) -> int:
+            return literal_tanh(limited(total * 2**shift, -(2**15), 2**15 - 1))
+
         after = []
-        for r, z, now, of_x, of_h in zip(gates[: len(h)], gates[len(h) :], h, given, own, strict=True):
-            n = literal_tanh(limited((of_x + (r * of_h + 2**14) // 2**15) * 2**unit.shift, -(2**15), 2**15 - 1))
-            after.append(n + ((now - n) * z + 2**14) // 2**15)
+        for k in range(units):
+            r, z = ((tanh(i[at] + m[at], unit.gate_shift) + 32768) // 2 for at in (k, units + k))
+            n = tanh(i[2 * units + k] + (r * m[2 * units + k] + 2**14) // 2**15, unit.shift)
+            after.append(n + ((h[k] - n) * z + 2**14) // 2**15)
         x = h = after
     y = literal_dense(kernel.layers[-1], x)
     return h, [limited(z, least, most) for z, least, most in zip(y, kernel.act_min, kernel.act_max, strict=True)]

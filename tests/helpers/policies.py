@@ -159,7 +159,7 @@ def gated_unit(rng: np.random.Generator, inputs: int, units: int) -> GatedUnit:
     def layer(rows: int, outputs: int) -> tuple[np.ndarray, np.ndarray]:
         return rng.normal(size=(rows, outputs)) * (2.0 / rows) ** 0.5, 0.5 * rng.normal(size=outputs)
 
-    return GatedUnit(layer(inputs + units, 2 * units), layer(inputs, units), layer(units, units))
+    return GatedUnit(layer(inputs, 3 * units), layer(units, 3 * units))
 
 
 def in_body_frame(base: Policy, frame: BodyFrame) -> Policy:
@@ -256,15 +256,14 @@ def outputs_and_unit(policy: Policy, inputs: np.ndarray) -> tuple[np.ndarray, np
 
 def literal_unit(unit: GatedUnit, x: np.ndarray, h: np.ndarray) -> np.ndarray:
     """The next h [n, H], number by number."""
-    (weight, bias), (of_x, bias_x), (of_h, bias_h) = unit.gates, unit.of_input, unit.of_memory
+    (of_x, bias_x), (of_h, bias_h), units = unit.of_input, unit.of_memory, h.shape[1]
     after = np.empty_like(h)
     for k in range(len(h)):
-        both = [*x[k], *h[k]]
-        sums = [bias[j] + sum(both[i] * weight[i, j] for i in range(len(both))) for j in range(2 * h.shape[1])]
-        for j in range(h.shape[1]):
-            r, z = (1.0 / (1.0 + np.exp(-sums[at])) for at in (j, h.shape[1] + j))
-            own = bias_h[j] + sum(h[k, i] * of_h[i, j] for i in range(h.shape[1]))
-            n = np.tanh(bias_x[j] + sum(x[k, i] * of_x[i, j] for i in range(x.shape[1])) + r * own)
+        i = [bias_x[j] + sum(x[k, a] * of_x[a, j] for a in range(x.shape[1])) for j in range(3 * units)]
+        m = [bias_h[j] + sum(h[k, a] * of_h[a, j] for a in range(units)) for j in range(3 * units)]
+        for j in range(units):
+            r, z = (1.0 / (1.0 + np.exp(-i[at] - m[at])) for at in (j, units + j))
+            n = np.tanh(i[2 * units + j] + r * m[2 * units + j])
             after[k, j] = z * h[k, j] + (1.0 - z) * n
     return after
 

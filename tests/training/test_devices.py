@@ -186,6 +186,6 @@ def test_a_seed_of_several_is_repeated_as_it_was_trained() -> None:
 def test_a_program_that_calls_python_has_two_threads(
     environment: dict, cores: int, threads: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(devices, "_cores", lambda: cores)
-    devices.configure_callbacks(environment)
+    monkeypatch.setattr(processes, "_cores", lambda: cores)
+    processes.configure_callbacks(environment)
     assert environment.get("PJRT_NPROC") == threads

@@ -265,13 +265,8 @@ def _layers(params: dict[str, Any], recurrent: bool) -> tuple[tuple[Layer, ...],
     if not recurrent:
         return tuple(layer(f"Dense_{i}") for i in range(len(params))), None
     hidden = tuple(layer(f"layers_{i}") for i in range(sum(name.startswith("layers_") for name in params)))
-    (weight, bias), own, candidate = layer("of_input"), params["of_memory"]["kernel"], params["candidate_bias"]
-    both = 2 * len(own)
-    unit = GatedUnit(
-        gates=(np.concatenate([weight[:, :both], own[:, :both]]), bias[:both]),
-        of_input=(weight[:, both:], bias[both:]),
-        of_memory=(own[:, both:], candidate),
-    )
+    own, candidate = params["of_memory"]["kernel"], params["candidate_bias"]
+    unit = GatedUnit(layer("of_input"), (own, np.pad(candidate, (2 * len(own), 0))))
     return (*hidden, layer("of_output")), unit
 
 

@@ -247,11 +247,8 @@ class _Layer(NamedTuple):
 def _layers(kernel: Kernel) -> list[_Layer]:
     found = []
     for dense in kernel.products:
-        parts = [dense.weight]
-        if kernel.unit and dense is kernel.unit.gates:  # each of its two inputs is padded
-            parts = np.split(dense.weight, [dense.weight.shape[1] - kernel.unit.units], axis=1)
-        weight = np.concatenate([np.pad(x, ((0, 0), (0, -x.shape[1] % 4))) for x in parts], axis=1)
-        weight = np.pad(weight, ((0, -len(weight) % 4), (0, 0)))
+        outputs, inputs = dense.weight.shape
+        weight = np.pad(dense.weight, ((0, -outputs % 4), (0, -inputs % 4)))
         found.append(_Layer(dense, weight, hidden=any(dense is layer for layer in kernel.layers[:-1])))
     return found
 
@@ -275,8 +272,9 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         if memory.integral:
             parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
     if units := kernel.memory.units if kernel.memory else 0:
-        numbers = {"UNIT_LAYER": len(kernel.layers) - 1, "UNIT_INPUTS": _padded(kernel.widths[-3])}
-        numbers |= {"CANDIDATE_SHIFT": kernel.unit.shift if kernel.unit else 0}
+        assert kernel.unit
+        numbers = {"UNIT_LAYER": len(kernel.layers) - 1}
+        numbers |= {"GATE_SHIFT": kernel.unit.gate_shift, "CANDIDATE_SHIFT": kernel.unit.shift}
         parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
         last = np.ascontiguousarray(golden.outputs.state[embedded(kernel) - 1, -2 * units :]).view("<i2")
         parts.append(_array("int16_t golden_recurrent[UNITS]", last, 12))

@@ -154,24 +154,28 @@ Layer = tuple[NDArray[np.float64], NDArray[np.float64]]  # weight [inputs, outpu
 
 @dataclass(frozen=True, eq=False)
 class GatedUnit:
-    """A gated recurrent unit of D inputs x and H numbers h: r, z = σ(x W + h U + b), n = tanh(x W_n + b_n + r·(h U_n +
-    c)), next h = z·h + (1 − z)·n (Cho et al. 2014, in cuDNN's form).
+    """A gated recurrent unit of D inputs x and H numbers h: with i = x W + b and m = h U + c, r = σ(i_r + m_r),
+    z = σ(i_z + m_z), n = tanh(i_n + r·m_n), next h = z·h + (1 − z)·n (Cho et al. 2014, in cuDNN's form).
     """
 
-    gates: Layer  # [D + H, 2H], [2H]: W over U, and b; r, then z
-    of_input: Layer  # [D, H], [H]: W_n and b_n
-    of_memory: Layer  # [H, H], [H]: U_n and c
+    of_input: Layer  # [D, 3H], [3H]: W and b; r, z, n
+    of_memory: Layer  # [H, 3H], [3H]: U and c
 
-    def sums(self, x: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-        """What gates [..., 2H] and candidate, of the input and of the memory [..., H] each, are given."""
-        terms = zip((self.gates, self.of_input, self.of_memory), (np.concatenate([x, h], axis=-1), x, h), strict=True)
-        return tuple(given @ weight + bias for (weight, bias), given in terms)
+    def sums(self, x: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """i and m [..., 3H]."""
+        (weight, bias), (own, own_bias) = self.of_input, self.of_memory
+        return x @ weight + bias, h @ own + own_bias
+
+    def parts(self, x: NDArray[np.float64], h: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """r, z, n and m_n [..., H] each."""
+        i, m = (np.split(part, 3, axis=-1) for part in self.sums(x, h))
+        r, z = sigmoid(i[0] + m[0]), sigmoid(i[1] + m[1])
+        return r, z, np.tanh(i[2] + r * m[2]), m[2]
 
     def __call__(self, x: NDArray[np.float64], h: NDArray[np.float64]) -> NDArray[np.float64]:
         """The next h; [..., D], [..., H] -> [..., H]."""
-        gates, of_input, of_memory = self.sums(x, h)
-        r, z = np.split(sigmoid(gates), 2, axis=-1)
-        return z * h + (1.0 - z) * np.tanh(of_input + r * of_memory)
+        _, z, n, _ = self.parts(x, h)
+        return z * h + (1.0 - z) * n
 
 
 def sigmoid(x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
-from qrl.export.policy import ACTIVATIONS, BodyFrame, GatedUnit, Layer, Policy, sigmoid
+from qrl.export.policy import ACTIVATIONS, BodyFrame, GatedUnit, Layer, Policy
 
 Floats = NDArray[np.float64]
 
@@ -134,36 +134,36 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
 
 def _following(policy: Policy, layers: list[Layer], i: int) -> Floats:
     """The weights [outputs of hidden layer i, n] of what comes after it."""
-    if policy.unit and i == len(layers) - 2:
-        return np.concatenate([policy.unit.gates[0][: len(layers[i][1])], policy.unit.of_input[0]], axis=1)
-    return layers[i + 1][0]
+    return policy.unit.of_input[0] if policy.unit and i == len(layers) - 2 else layers[i + 1][0]
 
 
 def _gated_unit(
     unit: GatedUnit, x_float: Floats, h_float: Floats, x: Ints, step: Floats, sensitivity: list[Floats], ridge: float
 ) -> tuple[integers.GatedUnit, Ints]:
     """The recurrent unit in integers, and its next h [n, H]; for its inputs in float, and x [n, D] in `step`."""
-    h = np.round(h_float * INT16).astype(np.int64)
-    of_h = np.full(h.shape[1], 1.0 / INT16)
-    steps, given = (np.concatenate([step, of_h]), step, of_h), (np.concatenate([x, h], axis=1), x, h)
+    h, units = np.round(h_float * INT16).astype(np.int64), h_float.shape[1]
     sums = unit.sums(x_float, h_float)
-    # r scales one of the candidate's two sums after both were saturated: they need more than the tanh's range.
-    largest = ACTIVATION_MARGIN * max(float(np.abs(part).max()) for part in sums[1:])
-    shift = int(np.clip(np.ceil(np.log2(largest / TANH_RANGE)), 0, 8))
-    tanh_step = TANH_RANGE / (INT16 + 1)
-    found = [
-        _dense(weight * lsb[:, None], target, q, slope, np.full(len(bias), factor * tanh_step), ridge)
-        for (weight, bias), target, lsb, q, slope, factor in zip(
-            (unit.gates, unit.of_input, unit.of_memory),
+    # A gate is a tanh of half of its sum. The sums are added up, or scaled by r, after they were saturated: they need
+    # more than the tanh's range.
+    factors = np.repeat([2.0, 1.0], [2 * units, units])
+    largest = ACTIVATION_MARGIN * np.max([np.abs(part).max(axis=0) for part in sums], axis=0) / factors / TANH_RANGE
+    shifts = [
+        int(np.clip(np.ceil(np.log2(np.maximum(part.max(), 1e-9))), 0, 8))
+        for part in (largest[: 2 * units], largest[2 * units :])
+    ]
+    out = factors * 2.0 ** np.repeat(shifts, [2 * units, units]) * TANH_RANGE / (INT16 + 1)
+    of_input, of_memory = (
+        _dense(weight * lsb[:, None], target, q, slope, out, ridge)
+        for (weight, _), target, lsb, q, slope in zip(
+            (unit.of_input, unit.of_memory),
             sums,
-            steps,
-            given,
+            (step, np.full(units, 1.0 / INT16)),
+            (x, h),
             sensitivity,
-            (2.0, 2.0**shift, 2.0**shift),  # a gate is a tanh of half of its sum
             strict=True,
         )
-    ]
-    made = integers.GatedUnit(*found, shift=shift)
+    )
+    made = integers.GatedUnit(of_input, of_memory, *shifts)
     return made, integers.remember(made, x, h)
 
 
@@ -325,7 +325,7 @@ def _check(policy: Policy) -> None:
     if units != (policy.unit.of_memory[0].shape[0] if policy.unit else 0) or (units and len(policy.layers) < 2):
         raise UnsupportedNetwork("a recurrent unit: expected a hidden layer before it, and its numbers in the memory")
     if policy.unit:
-        layers = policy.unit.gates, policy.unit.of_input, policy.unit.of_memory
+        layers = policy.unit.of_input, policy.unit.of_memory
         if not all(np.isfinite(x).all() for layer in layers for x in layer):
             raise UnsupportedNetwork("the recurrent unit: a weight is not finite")
     expected = len(policy.observations) + policy.memory_size - units
@@ -383,23 +383,18 @@ def _sensitivity(policy: Policy, layers: list[Layer], x: Floats, h: Floats) -> t
     by_action = [gain[:, [k]] * np.eye(len(low))[k] @ weight.T for k in range(len(low))]  # of the last layer's inputs
     of_unit: list[Floats] = []
     if unit := policy.unit:
-        gates, of_input, of_memory = unit.sums(x, h)
-        (r, z), n = (
-            np.split(sigmoid(gates), 2, axis=-1),
-            np.tanh(of_input + sigmoid(gates)[:, : h.shape[1]] * of_memory),
-        )
+        r, z, n, own = unit.parts(x, h)
         of_candidate = (1.0 - z) * (1.0 - n**2)
+        # Of r, z and n, given by the inputs; the memory's part of n is scaled by r.
         by_sums = [
-            (
-                np.concatenate([d * of_candidate * of_memory * r * (1.0 - r), d * (h - n) * z * (1.0 - z)], axis=1),
-                d * of_candidate,
-                d * of_candidate * r,
+            np.concatenate(
+                [d * of_candidate * own * r * (1.0 - r), d * (h - n) * z * (1.0 - z), d * of_candidate], axis=1
             )
             for d in by_action
         ]
-        of_unit = [sum(part**2 for part in parts) + np.zeros(()) for parts in zip(*by_sums, strict=True)]
-        own, candidate = unit.gates[0][: x.shape[1]], unit.of_input[0]
-        by_action = [of_gates @ own.T + of_sum @ candidate.T for of_gates, of_sum, _ in by_sums]
+        square = sum(part**2 for part in by_sums) + np.zeros(())
+        of_unit = [square, square * np.concatenate([np.ones_like(z), np.ones_like(z), r**2], axis=1)]
+        by_action = [part @ unit.of_input[0].T for part in by_sums]
     for i in range(len(slopes) - 1, -1, -1):
         by_action = [derivative * slopes[i] for derivative in by_action]
         sensitivity.insert(0, sum(derivative**2 for derivative in by_action) + np.zeros_like(slopes[i]))

@@ -345,31 +345,31 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 #if UNITS
 
-/* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
-static inline int32_t sigmoid(activation given) {
-    return (tanh_of((int32_t)given - OFFSET) + 32768) >> 1;
+static inline int32_t tanh_of_sum(int32_t sum, int shift) {
+    return tanh_of(limited(sum * (1 << shift), -32768, 32767));
 }
 
-/* A gated recurrent unit of three layers: inputs in `a`, then in their place its numbers h; `gates` is overwritten.
-   r, z = sigmoid(gates of x and h), n = tanh((of x + r * of h) * 2^shift), h = n + (h - n) * z */
-static void remember(const struct layer *l, union activations *a, union activations *gates, int16_t h[UNITS]) {
-    union activations of_input, of_memory;
-    activation *const after = a->one + UNIT_INPUTS;
-    for (int i = 0; i < (UNITS + 3) / 4 * 4; ++i) {
-        after[i] = (activation)((i < UNITS ? h[i] : 0) + OFFSET);
+/* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
+static inline int32_t sigmoid(activation i, activation m) {
+    return (tanh_of_sum((int32_t)i - OFFSET + (int32_t)m - OFFSET, GATE_SHIFT) + 32768) >> 1;
+}
+
+/* A gated recurrent unit of two layers, i of the inputs x in `a` and m of its own numbers h, which then take the place
+   of x; `i` is overwritten. r = sigmoid(i + m), z = sigmoid(i + m), n = tanh(i + r * m), h = n + (h - n) * z */
+static void remember(const struct layer *l, union activations *a, union activations *i, int16_t h[UNITS]) {
+    union activations m;
+    dense(l, a->one, i);
+    for (int k = 0; k < (UNITS + 3) / 4 * 4; ++k) {
+        a->one[k] = (activation)((k < UNITS ? h[k] : 0) + OFFSET);
     }
-    dense(l, a->one, gates);
-    dense(l + 1, a->one, &of_input);
-    dense(l + 2, after, &of_memory);
-    for (int i = 0; i < UNITS; ++i) {
-        const int32_t r = sigmoid(gates->one[i]), z = sigmoid(gates->one[UNITS + i]);
-        const int32_t more = shifted(r * ((int32_t)of_memory.one[i] - OFFSET), 15);
-        const int32_t sum = ((int32_t)of_input.one[i] - OFFSET + more) * (1 << CANDIDATE_SHIFT);
-        const int32_t n = tanh_of(limited(sum, -32768, 32767));
-        h[i] = (int16_t)(n + shifted((h[i] - n) * z, 15));
-    }
-    for (int i = 0; i < (UNITS + 3) / 4 * 4; ++i) {
-        a->one[i] = (activation)((i < UNITS ? h[i] : 0) + OFFSET);
+    dense(l + 1, a->one, &m);
+    for (int k = 0; k < UNITS; ++k) {
+        const activation *const ik = i->one + k, *const mk = m.one + k;
+        const int32_t r = sigmoid(ik[0], mk[0]), z = sigmoid(ik[UNITS], mk[UNITS]);
+        const int32_t more = shifted(r * ((int32_t)mk[2 * UNITS] - OFFSET), 15);
+        const int32_t n = tanh_of_sum((int32_t)ik[2 * UNITS] - OFFSET + more, CANDIDATE_SHIFT);
+        h[k] = (int16_t)(n + shifted((h[k] - n) * z, 15));
+        a->one[k] = (activation)(h[k] + OFFSET);
     }
 }
 
@@ -381,7 +381,7 @@ static const activation *network(union activations *a, union activations *b, @na
 #if UNITS
         if (l == layers + UNIT_LAYER) {
             remember(l, a, b, state->recurrent);
-            l += 3;
+            l += 2;
         }
 #endif
         dense(l, a->one, b);
