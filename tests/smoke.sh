@@ -183,6 +183,7 @@ circle_and_crazyflie() {
   "$python" -m json.tool "$out/circle/evaluation.json" >"$log/stdout" 2>"$log/stderr" || fail "evaluation.json"
   passes "view circle" make view RUN="$out/circle"
   page "$out/circle/view.html"
+  passes "fly a vehicle of mine" make fly VEHICLE="$vehicle" ARGS="--starts 8"
 
   grep -q geometric "$out/circle/evaluation.json" || fail "no baselines"
   [[ -s $out/circle/settle.png ]] || fail "no map of settle times"

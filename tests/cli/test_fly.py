@@ -7,6 +7,7 @@ import pytest
 
 from qrl.cli import fly as command
 from qrl.cli.main import build_parser
+from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import shipped
 
 
@@ -60,3 +61,17 @@ def test_fly_judges_and_shows(monkeypatch: pytest.MonkeyPatch) -> None:
         if name == "evaluate":
             wanted |= {"starts": 7, "off_nominal": True}
         assert vars(given) == wanted
+
+
+def test_the_policy_that_ships_is_read_and_small() -> None:
+    """Its settings are of this version, its checkpoint is whole, and no path of the machine that made it is in it."""
+    assert shipped.names() == ["any"]
+    run = TrainedRun.load(shipped.SHIPPED / "any")
+    policy = run.float_policy()
+    assert policy.unit
+    assert policy.provenance.seed >= 100, "none that settings were chosen on"
+    weights = sum(w.size + b.size for w, b in policy.layers) + sum(x.size for x in policy.unit.of_input)
+    assert weights + policy.unit.of_memory[0].size + policy.memory_size - 7 <= 4500
+    files = [path for path in (shipped.SHIPPED / "any").rglob("*") if path.is_file()]
+    assert sum(path.stat().st_size for path in files) < 300_000
+    assert not any(b"/home/" in path.read_bytes() or b"/tmp/" in path.read_bytes() for path in files)
