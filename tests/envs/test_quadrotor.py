@@ -417,3 +417,27 @@ def test_tilt_limits_the_starts_evenly() -> None:
     assert stats.kstest((cosine - np.cos(0.5)) / (1.0 - np.cos(0.5)), "uniform").pvalue > 1e-3
     heading = np.arctan2(R[:, 1, 0], R[:, 0, 0])
     assert stats.kstest((heading + np.pi) / (2.0 * np.pi), "uniform").pvalue > 1e-3
+
+
+def test_nested_starts_have_ranges_of_their_own() -> None:
+    """The same draws, each within the ranges times one factor for all of its coordinates, uniform in [0, 1)."""
+    plain = quadrotor.Start(*map(jnp.float32, (1.0, 2.0, 3.0, np.pi)))
+    keys = jax.random.split(jax.random.PRNGKey(0), 2000)
+    drawn = {
+        name: jax.vmap(lambda key, start=start: quadrotor.draw(start, key))(keys)
+        for name, start in {
+            "plain": plain,
+            "nested": plain._replace(nested=jnp.float32(1.0)),
+            "not": plain._replace(nested=jnp.float32(0.0)),
+        }.items()
+    }
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), drawn["not"], drawn["plain"])
+    factors = np.asarray(drawn["nested"].pose.position_m / drawn["plain"].pose.position_m)
+    np.testing.assert_allclose(factors, factors[:, :1] * np.ones(3), rtol=1e-4)
+    of_rate = np.asarray(drawn["nested"].twist.body_rate_rad_s / drawn["plain"].twist.body_rate_rad_s)
+    np.testing.assert_allclose(of_rate, factors, rtol=1e-3)
+    assert stats.kstest(factors[:, 0], "uniform").pvalue > 1e-3
+    _, x, y, _ = np.asarray(drawn["nested"].pose.attitude).T
+    tilt = np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1))
+    assert (tilt <= np.pi * factors[:, 0] + 1e-3).all()
+    assert tilt.mean() < 1.0 < tilt.max()

@@ -157,7 +157,7 @@ def test_random_motion_is_smooth_and_within_what_the_vehicle_can() -> None:
 
 def test_no_random_number_of_a_motion_is_used_twice() -> None:
     _, sines = motions(4000, moving=1.0)
-    table = np.concatenate([np.asarray(x).reshape(4000, -1) for x in sines], axis=1)
+    table = np.concatenate([np.asarray(x).reshape(4000, -1) for x in sines[:3]], axis=1)  # the rest follows
     correlation = np.abs(np.corrcoef(table.T) - np.eye(table.shape[1]))
     correlation[:6, 6:12] = correlation[6:12, :6] = 0  # a fast sine has a small amplitude
     correlation[:6, :6] = 0  # and all are scaled together

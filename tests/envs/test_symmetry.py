@@ -118,8 +118,13 @@ def test_a_real_vehicles_step_is_transformed_with_its_world(name: str, vehicle: 
             return drawn
         signs = np.repeat(world.sum(axis=2)[:, :, None], 2, axis=2)
         places = np.abs(world)
-        size, rate, phase = (jnp.asarray(np.einsum("nij,njk->nik", places, x), jnp.float32) for x in drawn)
-        return Sines(jnp.asarray(signs * size, jnp.float32), rate, phase)
+
+        def permuted(x: Any) -> jax.Array:
+            return jnp.asarray(np.einsum("nij,n...jk->n...ik", places, x), jnp.float32)
+
+        size, rate, phase = map(permuted, drawn[:3])
+        ahead = tuple(map(permuted, drawn.ahead))
+        return Sines(jnp.asarray(signs * size, jnp.float32), rate, phase, ahead)
 
     def turned(x: Any) -> Any:
         pushed = x.world.disturbance
