@@ -1,5 +1,6 @@
 """The command line before JAX is loaded, and environments of the user's own."""
 
+import json
 import os
 from pathlib import Path
 
@@ -94,3 +95,15 @@ def test_a_task_is_a_function_of_the_users(tmp_path: Path, monkeypatch: pytest.M
     }.items():
         with pytest.raises(BadInput, match=f"task '{name}': .*{why}"):
             tasks.task_record(name)
+
+
+@pytest.mark.parametrize("task", ["track", "any"])
+@pytest.mark.parametrize("period_s", [0.003, 0.007, 0.012, 0.02])
+def test_flights_that_are_split_carry_over_to_other_periods(task: str, period_s: float, tmp_path: Path) -> None:
+    """Their seconds stay, to a part's step, and the parts are of one length."""
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"extend": task, "control_period_s": period_s, "preview_s": []}))
+    values = tasks.task_preset(tasks.task_record(str(path)), "here")
+    config = Config.model_validate_json(json.dumps(values))
+    flight_s = {"track": 8.0, "any": 4.0}[task]
+    assert abs(config.apg_episode_length * period_s - flight_s) <= config.apg_split * period_s
