@@ -19,6 +19,7 @@ define HELP
        UNCERTAINTY=default             what differs from flight to flight: a shipped name, or a .json of yours
        OUT=runs/circle                 the run folder
        RESUME=1                        resume that run from its last checkpoint
+       INIT=any                        begin with the policy of that run: fine-tune it
        CONFIG=f.json                   hyperparameters, or the config.json of a run to repeat
        ARGS="--gamma 0.97"             any other flag of `qrl train`; `qrl train --help` lists them
   make identify LOG=flight.csv VEHICLE=start.json   fit a vehicle's file to logs of its flights (LOG="a.csv b.csv")
@@ -82,7 +83,7 @@ train: $(STAMP)
 	@exec $(QRL) train $(if $(TASK),$(call quoted,$(TASK))) $(call flag,--seed,$(SEED)) $(call flag,--seeds,$(SEEDS)) \
 		$(call flag,--vehicle,$(VEHICLE)) $(call flag,--uncertainty,$(UNCERTAINTY)) \
 		$(call flag,--reference,$(REFERENCE)) $(call flag,--out,$(OUT)) $(if $(filter-out 0,$(RESUME)),--resume) \
-		$(call flag,--config,$(CONFIG)) $(ARGS)
+		$(call flag,--config,$(CONFIG)) $(call flag,--init,$(INIT)) $(ARGS)
 
 # LOG is a list: its words are not quoted.
 identify: $(STAMP)

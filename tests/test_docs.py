@@ -83,6 +83,7 @@ def test_commands_exist(line: str) -> None:
             "FAST",
             "NAME",
             "UNCERTAINTY",
+            "INIT",
             "LOG",
             "REFERENCE",
             "PYTHON",

@@ -123,6 +123,7 @@ def train(
     uncertainty: str | Path | None = None,
     reference: str | Path | None = None,
     preset: str | None = None,
+    init: str | Path | None = None,
     resume: bool = False,
     quiet: bool = False,
     **hyperparameters: Any,
@@ -136,6 +137,7 @@ def train(
     uncertainty: what differs from flight to flight, a shipped name or a path to a .json, in place of the task's own
     reference: what a task tracks and is judged on, a shipped name or a path to a .json or .csv, in place of its own
     preset: hyperparameters by name, in place of the task's preset; not together with a Config, which has them all
+    init: begin with the policy of that run, its folder or the name of one that ships; the preset is "fine_tune" then
     resume: continue the run that the folder holds; one that is complete is loaded
     quiet: print nothing
     hyperparameters: fields of `Config`, such as gamma=0.97; NumPy values are welcome
@@ -163,6 +165,7 @@ def train(
         seeds=1,
         out=folder,
         preset=preset,
+        init=None if init is None else str(init),
         resume=resume,
         **flags,
     )
@@ -189,7 +192,7 @@ def _checked(values: Mapping[str, Any]) -> dict[str, Any]:
     values = current_names(values, "qrl.train")
     for name in values:
         if name not in Config.model_fields:
-            known = [*Config.model_fields, "preset", "resume", "quiet"]
+            known = [*Config.model_fields, "preset", "init", "resume", "quiet"]
             raise BadInput(f"qrl.train: unknown argument '{name}'{nearest(name, known)}")
     return {name: _valid(name, hints[name], value) for name, value in values.items()}
 

@@ -155,7 +155,7 @@ class Config(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Config":
-        if self.warmup_unrolls > self.learning_unrolls:
+        if self.warmup_unrolls > self.learning_unrolls and not self.all_apg:
             least, found = (n * self.steps_per_unroll for n in (self.warmup_unrolls, self.learning_unrolls))
             before = " before APG" if self.num_apg_updates else ""
             raise ValueError(
@@ -229,6 +229,11 @@ class Config(BaseModel):
     def learning_unrolls(self) -> int:
         """Unrolls that are collected and learned from; the rest of the steps are those of APG."""
         return self.num_unrolls - self.num_apg_updates * self.unrolls_per_apg_update
+
+    @property
+    def all_apg(self) -> bool:
+        """Whether every step is APG's: a run that begins with a policy that flies needs no other."""
+        return self.num_apg_updates > 0 and self.learning_unrolls == 0
 
     def estimated_cost(self, first: int, last: int) -> float:
         """Work from `first` to `last` unrolls, in steps that are flown or learned from."""

@@ -8,7 +8,7 @@ from typing import Any
 from qrl import tasks
 from qrl.config import Config
 from qrl.runs import record as records
-from qrl.runs.record import ConfigFile, RunConfig, TaskRecord
+from qrl.runs.record import ConfigFile, Init, RunConfig, TaskRecord
 from qrl.training.devices import device_names
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput
@@ -37,11 +37,12 @@ def run_config(
     seeds: int | None,
     parts: Mapping[str, str | None] = MappingProxyType({}),
     preset: str | None = None,
+    init: tuple[Init, Config] | None = None,
 ) -> RunConfig:
     """The run asked for: flags over CONFIG (`file`, read from `config`) over `preset`, or the task's, over the default.
 
     `parts`: names or paths of the task's vehicle, uncertainty and reference, in place of its own. The run names no
-    devices yet: JAX has not been asked for them.
+    devices yet: JAX has not been asked for them. `init`: the policy that it begins with, and the learner of its run.
     """
     record = file.task
     assert not isinstance(record, str)  # config_file saw to it
@@ -56,7 +57,8 @@ def run_config(
         raise BadInput(f"no task given (known: {', '.join(shipped())}; all: qrl tasks)")
     run = RunConfig(
         task=record,
-        learner=_learner(record, task or str(config), config, file.learner, flags, preset),
+        learner=_learner(record, task or str(config), config, file.learner, flags, preset, init and init[1]),
+        init=init and init[0],
         seed=next((s for s in (seed, file.seed) if s is not None), 0),
         seeds=seeds or file.seeds or 1,
         versions=records.versions(),
@@ -72,8 +74,9 @@ def _learner(
     learner: dict[str, Any],
     flags: dict[str, Any],
     preset: str | None,
+    known: Config | None,
 ) -> Config:
-    base = tasks.task_preset(record, "--preset" if preset else where, preset) | learner
+    base = tasks.task_preset(record, "--preset" if preset else where, preset, known) | learner
     file = f"{config}: learner" if config else f"preset of {record.name}"
     try:
         return specfile.build(Config, base | flags, "command line")
@@ -105,6 +108,8 @@ def resumed(folder: Path, asked: RunConfig, given: dict[str, Any], seed: int | N
     for name, found, wanted in (("seed", run.seed, seed), ("seeds", run.seeds, seeds)):
         if wanted is not None and wanted != found:
             raise BadInput(f"{wrong} key '{name}' is {found}, found {wanted} on the command line")
+    if asked.init and asked.init != run.init:
+        raise BadInput(f"{wrong} key 'init' is {run.init and run.init.run}, asked for {asked.init.run}")
     for name in given:
         found, wanted = getattr(run.learner, name), getattr(asked.learner, name)
         if found != wanted:

@@ -22,9 +22,11 @@ from qrl_envs import specfile
 from qrl_envs import task as task_spec
 from qrl_envs.reference import reference_data
 from qrl_envs.specfile import BadInput
+from qrl_envs.uncertainty import uncertainty_data
 from qrl_envs.vehicle import vehicle_data
 
 PRESET_RECOVERY_S = 0.6  # and the time scale of their vehicle, the paper's (Vehicle.recovery_s)
+BASE_OBSERVATIONS = {"quadrotor": 18, "pendulum": 3}  # that each task of the world begins with
 PRESET_PERIOD_S = {"quadrotor": 0.01, "pendulum": 0.05}  # control periods that the presets are made for
 
 
@@ -57,9 +59,18 @@ def task_record(name: str, parts: Mapping[str, str | None] = MappingProxyType({}
         if name in foreign_tasks():
             return TaskRecord(name=name, spec=None)
         raise BadInput(f"unknown task '{name}'{specfile.nearest(name, [*task_spec.shipped(), *foreign_tasks()])}")
-    spec = task_spec.load(name, **asked).model_dump(mode="json", exclude_none=True)
-    stem = "_".join(Path(part).stem for part in (name, *asked.values()))
-    return TaskRecord(name=_folder(stem, name), spec=spec)
+    folder = _folder("_".join(Path(part).stem for part in (name, *asked.values())), name)
+    task = task_spec.load(name, **{key: value for key, value in asked.items() if key != "vehicle"})
+    if vehicle := asked.get("vehicle"):
+        if isinstance(task, task_spec.QuadrotorTask) and task.distribution:
+            spread = uncertainty_data(asked.get("uncertainty", "default"))
+            return _of_vehicle(TaskRecord(name=folder, spec=_spec_data(task)), vehicle, spread)
+        task = task_spec.load(name, **asked)
+    return TaskRecord(name=folder, spec=_spec_data(task))
+
+
+def _spec_data(task: task_spec.Task) -> dict[str, Any]:
+    return task.model_dump(mode="json", exclude_none=True)
 
 
 def _call_factory(name: str) -> Env:
@@ -130,22 +141,25 @@ def following(record: TaskRecord, reference: str | None = None, vehicle: str | N
     """
     if reference is None and vehicle is None:
         return record
-    given, words = dict(record.spec or {}), []
     if reference is not None:
-        if "reference" not in given:
+        if "reference" not in (given := record.spec or {}):
             raise BadInput(f"--reference: expected a task that tracks one, found '{record.name}'")
         given = task_spec.with_reference(given, reference_data(reference))
-        words.append(f"reference {reference}")
-    if vehicle is not None:
-        if "distribution" not in given:
-            raise BadInput(f"--vehicle: expected a policy of any vehicle, found one of '{record.name}'")
-        own = vehicle_data(vehicle)
-        places = _like(own.get("motors", []), given["vehicle"]["motors"], vehicle)
-        del given["distribution"]
-        given |= {"vehicle": {**own, "motors": places}, "uncertainty": {}}
-        words.append(f"vehicle {vehicle}")
-    task = task_spec.from_data(given, f"{record.name} with {' and '.join(words)}")
-    return TaskRecord(name=record.name, spec=task.model_dump(mode="json", exclude_none=True))
+        task = task_spec.from_data(given, f"{record.name} with reference {reference}")
+        record = TaskRecord(name=record.name, spec=_spec_data(task))
+    return record if vehicle is None else _of_vehicle(record, vehicle, {})
+
+
+def _of_vehicle(record: TaskRecord, vehicle: str, uncertainty: dict[str, Any]) -> TaskRecord:
+    """A task of any vehicle, of this one alone."""
+    if "distribution" not in (given := record.spec or {}):
+        raise BadInput(f"--vehicle: expected a policy of any vehicle, found one of '{record.name}'")
+    own = vehicle_data(vehicle)
+    motors = _like(own.get("motors", []), given["vehicle"]["motors"], vehicle)
+    given = {key: value for key, value in given.items() if key != "distribution"}
+    given |= {"vehicle": {**own, "motors": motors}, "uncertainty": uncertainty}
+    task = task_spec.from_data(given, f"{record.name} with vehicle {vehicle}")
+    return TaskRecord(name=record.name, spec=_spec_data(task))
 
 
 def _like(motors: list[Any], known: list[dict[str, Any]], where: str) -> list[dict[str, Any]]:
@@ -174,7 +188,7 @@ def _along_z(motor: dict[str, Any]) -> bool:
 
 def check_task_record(record: TaskRecord, where: str) -> TaskRecord:
     if record.spec is not None:
-        spec = task_spec.from_data(record.spec, f"{where}: task.spec").model_dump(mode="json", exclude_none=True)
+        spec = _spec_data(task_spec.from_data(record.spec, f"{where}: task.spec"))
         return TaskRecord(name=_folder(record.name, f"{where}: key 'task.name'"), spec=spec)
     if ":" in record.name:
         try:
@@ -194,11 +208,32 @@ def preset(name: str, where: str) -> dict[str, Any]:
         raise BadInput(f"{where}: {error}") from None
 
 
-def task_preset(record: TaskRecord, where: str, name: str | None = None) -> dict[str, Any]:
-    """The learner's defaults for a task, which `where` names: its preset, or that of `name`, carried over to it."""
+# Of a learner's values those that say what the policy's network is.
+NETWORK = (
+    "policy_hidden_layer_sizes",
+    "policy_gru_size",
+    "activation",
+    "observation_scale",
+    "normalize_observations",
+)
+FINE_TUNING = "fine_tune"  # the preset of a run that begins with a trained policy
+
+
+def task_preset(record: TaskRecord, where: str, name: str | None = None, known: Config | None = None) -> dict[str, Any]:
+    """The learner's defaults for a task, which `where` names: its preset, or that of `name`, carried over to it.
+
+    A run that begins with a policy which the learner `known` trained has its network, and a preset of its own.
+    """
+    if known:
+        name = name or FINE_TUNING
     if record.spec is None:
-        return preset(name or "default", where)
+        values = preset(name or "default", where)
+        return values | {key: getattr(known, key) for key in NETWORK} if known else values
     values = preset(name or record.spec["preset"], where if name else f"{where}: the task's key 'preset'")
+    if known:
+        scale = known.observation_scale
+        values |= {key: getattr(known, key) for key in NETWORK}
+        values["observation_scale"] = scale and list(scale[: BASE_OBSERVATIONS[record.spec["world"]]])
     return _carried_over(values, spec(record))
 
 

@@ -90,6 +90,8 @@ def build_parser() -> _Parser:
     train.add_argument("--config", type=Path, metavar="FILE", help="config.json, complete or in part")
     train.add_argument("--resume", action="store_true", help="resume from the run folder's last checkpoint")
     train.add_argument("--preset", metavar="NAME", help="preset of hyperparameters, in place of the task's")
+    begin = "begin with the policy of a run, its folder or the name of one that ships (any): fine-tune it"
+    train.add_argument("--init", metavar="RUN", help=begin)
     _add_hyperparameters(train)
 
     evaluate = commands.add_parser("evaluate", help="fly a trained policy from fresh starts")

@@ -15,9 +15,11 @@ import jax
 import numpy as np
 
 from qrl import request, tasks
+from qrl.algorithm.running_statistics import RunningStatistics
 from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, clock, console, print_error, progress_bar, stop_requested
 from qrl.cli.verdict import FLIES, verdict
 from qrl.config import Config
+from qrl.evaluation import initial
 from qrl.runs import files, record
 from qrl.runs.files import Row
 from qrl.runs.record import RunConfig
@@ -62,7 +64,7 @@ def train(args: argparse.Namespace) -> int:
             finished = run(plan, stopped)
     if finished is None:
         asked = {"TASK": args.task, "CONFIG": args.config, "VEHICLE": args.vehicle, "UNCERTAINTY": args.uncertainty}
-        asked["REFERENCE"] = args.reference
+        asked |= {"REFERENCE": args.reference, "INIT": args.init}
         subject = " ".join(f"{name}={shlex.quote(str(value))}" for name, value in asked.items() if value)
         console.print(f"stopped and saved; to resume: make train {subject} OUT={shlex.quote(str(plan.out))} RESUME=1")
         return FAILED
@@ -76,7 +78,9 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     flags = _flags(args)
     file = request.config_file(args.config)
     parts = {"vehicle": args.vehicle, "uncertainty": args.uncertainty, "reference": args.reference}
-    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds, parts, args.preset)
+    first = initial.load(args.init) if args.init else initial.recorded(file.init) if file.init else None
+    known = first and (first.init, first.run.learner)
+    config = request.run_config(args.task, args.config, file, flags, args.seed, args.seeds, parts, args.preset, known)
     out: Path = args.out or Path("runs") / tasks.folder_name(config.task)
     if out.exists() and not out.is_dir():
         raise BadInput(f"{out}: expected a folder, or a name for a new one; it is a file")
@@ -99,7 +103,10 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     for warning in tasks.spec(config.task).warnings() if config.task.spec else []:
         print_error(f"warning: {config.task.name}: {warning}")
     where = "command line" if "observation_scale" in flags else str(args.config or config.task.name)
-    tasks.check(tasks.environment(config.task), config.learner, where)
+    env = tasks.environment(config.task)
+    if first:
+        initial.check(first, config, env)
+    tasks.check(env, config.learner, where)
     devices.check_devices(config)
     out.mkdir(parents=True, exist_ok=True)
     stack.enter_context(files.locked(out / "lock", f"{out}: in use by another process"))
@@ -118,7 +125,9 @@ def run(plan: Plan, stopped: Callable[[], bool]) -> loop.Finished | None:
     env = tasks.environment(config.task)
     finished, start_time = None, time.perf_counter()
     with progress_bar(config.learner.num_unrolls * config.learner.steps_per_unroll) as update:
-        for event in loop.train(env, config, plan.out, resume=plan.exists, stopped=stopped):
+        for event in loop.train(
+            env, config, plan.out, resume=plan.exists, stopped=stopped, policy=_first_policy(config)
+        ):
             match event:
                 case loop.Compiling():
                     console.print("compiling")
@@ -144,6 +153,18 @@ def run(plan: Plan, stopped: Callable[[], bool]) -> loop.Finished | None:
                 case loop.Finished():
                     finished = event
     return finished
+
+
+def _first_policy(config: RunConfig) -> Callable[[], tuple[Any, RunningStatistics]] | None:
+    """What a run that begins with a trained policy begins with, read when it is called."""
+    if (init := config.init) is None:
+        return None
+
+    def read() -> tuple[Any, RunningStatistics]:
+        found = initial.recorded(init)
+        return found.policy, found.statistics
+
+    return read
 
 
 def write_results(plan: Plan, finished: loop.Finished, seconds: float) -> None:

@@ -91,6 +91,11 @@ class TrainedRun:
         except OSError as error:
             raise BadInput(str(error)) from None
 
+    @property
+    def deployed(self) -> LearnerState:
+        """The learner in NumPy, float64, with the policy that is deployed."""
+        return self._programs.deployed(self._learner)
+
     def fly(self, starts: chex.PRNGKey, env: Env | None = None) -> Flights:
         """Deterministic flights of the float policy in NumPy, leading axis: starts; `env`: by default the run's own."""
         return self._programs.fly(self._learner, env or self.env, starts)
@@ -176,7 +181,7 @@ class TrainedRun:
         says in its order: the previous action a [A] in [−1, 1], the integral [k] in m·s; then what the policy does not
         see, if anything.
         """
-        config, deployed = self.config.learner, self._programs.deployed(self._learner)
+        config, deployed = self.config.learner, self.deployed
         units = config.policy_gru_size or 0
         memory = replace(memory, units=units) if memory else self._memory(units)
         layers, unit = _layers(deployed.params.policy["params"], recurrent=bool(config.policy_gru_size))

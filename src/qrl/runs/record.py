@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from qrl.config import Config, current_names
 from qrl_envs.specfile import Count, CountOrZero
@@ -34,12 +34,20 @@ def with_current_names(data: dict[str, Any], where: str) -> dict[str, Any]:
     return data | {"learner": current_names(learner, f"{where}: learner")} if isinstance(learner, dict) else data
 
 
+class Init(_Record):
+    """The trained policy that a run begins with."""
+
+    run: str  # its run folder, or the name of a run that ships, as the user gave it
+    sha256: str  # of its numbers
+
+
 class ConfigFile(_Record):
     """The file of CONFIG=: a run's config.json, or any part of one. Versions and devices are information only."""
 
     format: Literal[1] = FORMAT
     task: str | TaskRecord | None = None
     learner: dict[str, Any] = {}
+    init: Init | None = None
     seed: CountOrZero | None = None
     seeds: Count | None = None
     versions: dict[str, str] = {}
@@ -52,6 +60,7 @@ class RunConfig(_Record):
     format: Literal[1] = FORMAT
     task: TaskRecord
     learner: Config
+    init: Init | None = Field(default=None, exclude_if=lambda x: x is None)  # null: random numbers
     seed: CountOrZero
     seeds: Count
     versions: dict[str, str]
@@ -64,8 +73,8 @@ class RunConfig(_Record):
 
     @property
     def sha256(self) -> str:
-        """The fingerprint of the run: task, hyperparameters and seeds, not versions or devices."""
-        settings = self.model_dump(mode="json", include={"task", "learner", "seed", "seeds"})
+        """The fingerprint of the run: task, hyperparameters, seeds and what it began with, not versions or devices."""
+        settings = self.model_dump(mode="json", include={"task", "learner", "init", "seed", "seeds"})
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 

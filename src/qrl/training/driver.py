@@ -61,7 +61,8 @@ class Programs:
 
 
 def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
-    return trainer.train.lower(states, inputs, np.int32(0)).compile()
+    """None for a run of APG alone."""
+    return None if trainer.config.all_apg else trainer.train.lower(states, inputs, np.int32(0)).compile()
 
 
 def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from qrl.algorithm.flights import Flights
+from qrl.algorithm.running_statistics import RunningStatistics
 from qrl.algorithm.types import Env
 from qrl.runs import checkpoint, files, record
 from qrl.runs.checkpoint import Checkpoint, Record
@@ -101,8 +103,19 @@ class Member:
         self._tensorboard.close()
 
 
-def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callable[[], bool]) -> Iterator[Event]:
+def train(
+    env: Env,
+    run: RunConfig,
+    out: Path,
+    *,
+    resume: bool,
+    stopped: Callable[[], bool],
+    policy: Callable[[], tuple[Any, RunningStatistics]] | None = None,
+) -> Iterator[Event]:
     """Train into the run folder(s) of `out`, from the last valid checkpoint if `resume`; yields what happens.
+
+    `policy` gives the network's numbers that the run begins with, and the statistics of observations: by default
+    random numbers, and none.
 
     Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept. Of several
     processes only the coordinator reads and writes.
@@ -126,6 +139,7 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
             yield Resumed(begin, notes)
         if states is None:
             states = trainer.init(driver.seeds(run.seed, run.seeds), inputs)
+            states = _beginning_with(states, *policy()) if policy else states
         programs = Programs(
             train=compiled_train.result(),
             fly=compiled_fly.result(),
@@ -148,6 +162,21 @@ def train(env: Env, run: RunConfig, out: Path, *, resume: bool, stopped: Callabl
         executor.shutdown(cancel_futures=True)
         for member in members:
             member.close()
+
+
+def _beginning_with(states: TrainState, policy: Any, statistics: RunningStatistics) -> TrainState:
+    """`states` with the policy of every member, and its statistics where they are of as many observations."""
+
+    def filled(now: Any, new: Any) -> Any:
+        # Added to zeros of the state, for these are placed as the programs expect it.
+        return jax.tree.map(lambda old, x: jnp.zeros_like(old) + jnp.asarray(x, old.dtype), now, new)
+
+    learner = states.learner
+    params = learner.params._replace(policy=filled(learner.params.policy, policy))
+    if learner.statistics.mean.shape[-1] == statistics.mean.shape[-1]:
+        learner = learner._replace(statistics=filled(learner.statistics, statistics))
+    average = filled(learner.average, policy)
+    return states._replace(learner=learner._replace(params=params, average=average))
 
 
 def _resume(
