@@ -71,7 +71,7 @@ quick_compilation_of_module = pytest.fixture(scope="module")(_quickly)
 @pytest.fixture
 def cross() -> None:
     """For a test that runs on targets of its own choice."""
-    need(targets.missing_tools())
+    need([tool for toolchain in (targets.CORTEX_M, targets.RISC_V) for tool in targets.missing_tools(toolchain)])
 
 
 @pytest.fixture

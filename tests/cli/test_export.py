@@ -33,7 +33,7 @@ FILES = policies.emitted_files("qrl_pendulum") | {"report.md"}
 def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few flights to calibrate on, and no Cortex-M: test_verify.py has those."""
     monkeypatch.setattr(calibration, "STARTS", 10)
-    monkeypatch.setattr(targets, "missing_tools", lambda: ["the cross compiler"])
+    monkeypatch.setattr(targets, "missing_tools", lambda _: ["the cross compiler"])
 
 
 @pytest.fixture

@@ -198,6 +198,22 @@ def test_lqr_is_scipys_of_finite_differences(name: str) -> None:
     assert np.abs(np.linalg.eigvals(a)).max() > 0.9999
 
 
+@pytest.mark.parametrize("name", ["hover", "circle"])
+def test_lqr_stabilizes_six_motors(name: str) -> None:
+    vehicle = {"mass_kg": 1.3, "inertia_kg_m2": [0.012, 0.014, 0.02], "action_scale_N": 3.0}
+    places = [(0.25 * np.cos(angle), 0.25 * np.sin(angle)) for angle in np.pi / 3 * np.arange(6)]
+    motors = [{"position_m": [*place], "spin": (-1) ** i, "max_N": 6.0} for i, place in enumerate(places)]
+    six = quadrotor_task(name, vehicle={**vehicle, "motors": motors})
+    model = lqr.linearize(six)
+    gain = lqr.gain(model, *lqr.weights(six))
+    assert gain.shape == (6, len(model.a))
+    assert (
+        np.abs(np.linalg.eigvals(model.a - model.b @ gain)).max()
+        < 1.0
+        < np.abs(np.linalg.eigvals(model.a)).max() + 1e-3
+    )
+
+
 def test_weights_are_the_tasks() -> None:
     """Of the circle: distance, chi = r·vy − 2 by radius and speed; half a turn and an action count as 2 m do."""
     q, r = lqr.weights(CIRCLE)

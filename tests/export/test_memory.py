@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import policies
-from cross_targets import EACH, EITHER, need
+from cross_targets import EACH, EITHER, RV32IMC, need
 from literal_network import limited, literal_network
 from policies import HOVER, ODD, REMEMBERING, TRACK
 from qrl.export import emit, targets, vectors
@@ -432,6 +432,7 @@ def test_each_memory_alone_gives_the_references_bits(core: Core | None, source_o
 
 
 BARS = {"M0": (29_500, 28_500), "M3": (19_000, 18_500), "M4F": (11_100, 10_700), "M7": (11_100, 10_700)}
+BARS |= {"M33": BARS["M4F"], "M55": BARS["M4F"], "RV32IMC": (27_500, 26_500)}
 
 
 @EACH
@@ -445,7 +446,7 @@ def test_memory_costs_little(core: Core, source_of: SourceOf, tmp_path: Path) ->
     assert size.text + size.data <= 10_240
     assert (size.data, size.bss, found.state.shape[1]) == (0, 0, 20)
     assert max(counts.stack_f32, counts.stack_i16) <= 400
-    assert counts.stack_selftest <= 512
+    assert counts.stack_selftest <= (544 if core is RV32IMC else 512)
 
 
 @EITHER
@@ -600,7 +601,7 @@ def test_the_self_test_sees_the_memory(fault: str, by: int, tmp_path: Path) -> N
 
 @pytest.mark.usefixtures("host")
 def test_a_sound_kernel_is_verified_over_sequences(source_of: SourceOf, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(targets, "missing_tools", lambda: ["the cross compiler"])
+    monkeypatch.setattr(targets, "missing_tools", lambda _: ["the cross compiler"])
     policy, kernel = policies.remembering("odd"), policies.remembering_kernel("odd")
     report = verify(policy, kernel, source_of("odd", "relu"), FEW)
     assert report.passed == ["host, -O2", "host, -O3 -ffast-math"]
@@ -612,7 +613,7 @@ def test_a_fault_that_only_long_sequences_show_fails_verification(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The limit of the integral, which a second of flight does not reach."""
-    monkeypatch.setattr(targets, "missing_tools", lambda: ["the cross compiler"])
+    monkeypatch.setattr(targets, "missing_tools", lambda _: ["the cross compiler"])
     policy, kernel = policies.remembering(), policies.remembering_kernel()
     assert kernel.memory
     assert kernel.memory.integral

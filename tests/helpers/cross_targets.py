@@ -6,10 +6,10 @@ import pytest
 
 from qrl.export.targets import CORES
 
-M0, M3, M4F, M7 = CORES
+M0, M3, M4F, M7, M33, M55, RV32IMC = CORES
 # For the fixture `core`: None is the host.
 EACH = pytest.mark.parametrize("core", CORES, ids=[core.name for core in CORES], indirect=True)
-EITHER = pytest.mark.parametrize("core", [None, M0, M4F], ids=["host", "M0", "M4F"], indirect=True)
+EITHER = pytest.mark.parametrize("core", [None, M0, M4F, RV32IMC], ids=["host", "M0", "M4F", "RV32IMC"], indirect=True)
 
 
 def need(missing: list[str]) -> None:

@@ -42,7 +42,7 @@ class Trim(NamedTuple):
     velocity_m_s: Array  # [3]
     attitude: Array  # [4] quaternion, body -> frame
     body_rate_rad_s: Array  # [3]
-    action: Array  # [4]
+    action: Array  # [A], one of each motor
 
 
 class LinearModel(NamedTuple):
@@ -50,11 +50,11 @@ class LinearModel(NamedTuple):
 
     trim: Trim
     a: np.ndarray  # [n, n]
-    b: np.ndarray  # [n, 4]
+    b: np.ndarray  # [n, A]
 
 
 def controller(task: QuadrotorTask) -> Callable[[chex.Array], chex.Array]:
-    """The regulator of a task's training reward: observation [..., 18 or more] -> action [..., 4] in [−1, 1].
+    """The regulator of a task's training reward: observation [..., 18 or more] -> action [..., A] in [−1, 1].
 
     Raises NumPy's LinAlgError if the motors cannot stabilize the vehicle.
     """
@@ -63,7 +63,7 @@ def controller(task: QuadrotorTask) -> Callable[[chex.Array], chex.Array]:
 
 
 def state_feedback(trim: Trim, gain: np.ndarray) -> Callable[[chex.Array], chex.Array]:
-    """The controller trim.action − gain · error, with a gain [4, 12] or, on the circle, [4, 11]."""
+    """The controller trim.action − gain · error, with a gain [A, 12] or, on the circle, [A, 11]."""
     on_circle = gain.shape[1] < ERRORS
 
     def control(observation: chex.Array) -> chex.Array:
@@ -76,14 +76,14 @@ def state_feedback(trim: Trim, gain: np.ndarray) -> Callable[[chex.Array], chex.
 
 
 def gain(model: LinearModel, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """The LQR gain [4, n] for weights `q` [n, n] of the error and `r` [4, 4] of the action."""
+    """The LQR gain [A, n] for weights `q` [n, n] of the error and `r` [A, A] of the action."""
     a, b = model.a, model.b
     cost = scipy.linalg.solve_discrete_are(a, b, q, r)
     return np.linalg.solve(r + b.T @ cost @ b, b.T @ cost @ a)
 
 
 def weights(task: QuadrotorTask) -> tuple[np.ndarray, np.ndarray]:
-    """The weights q [n, n] of the error and r [4, 4] of the action."""
+    """The weights q [n, n] of the error and r [A, A] of the action."""
     reward, far_m = task.evaluation.reward, max(task.evaluation.start.position_m, task.evaluation.distance_m)
     if isinstance(reward, CircleReward):
         position, axes = reward.w4_distance_1_m, 2  # radius and height
@@ -95,7 +95,7 @@ def weights(task: QuadrotorTask) -> tuple[np.ndarray, np.ndarray]:
         chi = np.zeros(len(q))  # gradient of x·vy − y·vx: by the radius, and by the velocity along the circle
         chi[0], chi[3] = reward.speed_m_s, reward.radius_m
         q += reward.w5_direction_s_m2 * np.outer(chi, chi)
-    return q, position * far_m**2 * np.eye(4)
+    return q, position * far_m**2 * np.eye(len(task.vehicle.motors))
 
 
 def linearize(task: QuadrotorTask) -> LinearModel:
@@ -105,7 +105,7 @@ def linearize(task: QuadrotorTask) -> LinearModel:
     and the small outward velocity that a step of 10 ms leaves are solved for.
     """
     physics, reward, dt_s = quadrotor.physics(task.vehicle), task.reward, task.control_period_s
-    on_circle = isinstance(reward, CircleReward)
+    on_circle, motors = isinstance(reward, CircleReward), len(task.vehicle.motors)
 
     def next_error(trim: Trim, delta: chex.Array) -> chex.Array:
         """The error [12] after a step from the error delta[:12] under trim.action + delta[12:]."""
@@ -118,10 +118,10 @@ def linearize(task: QuadrotorTask) -> LinearModel:
     def newton_step(trim: Trim, delta: chex.Array) -> tuple[Trim, chex.Array, chex.Array]:
         body, action = _perturbed(trim, delta)
         (position, attitude), (velocity, rate) = body
-        trim, zero = Trim(position, velocity, attitude, rate, action), jnp.zeros(ERRORS + 4)
+        trim, zero = Trim(position, velocity, attitude, rate, action), jnp.zeros(ERRORS + motors)
         return trim, next_error(trim, zero), jax.jacfwd(next_error, argnums=1)(trim, zero)
 
-    index = np.arange(ERRORS + 4)
+    index = np.arange(ERRORS + motors)
     # Unknowns: all but position, speed along the circle, and heading; in hover the thrusts alone.
     free = ~np.isin(index, [0, 1, 2, 4]) if on_circle else index >= ERRORS
     kept = index[:ERRORS] != ALONG_TRACK if on_circle else index[:ERRORS] >= 0
@@ -144,7 +144,7 @@ def _initial_trim(task: QuadrotorTask) -> Trim:
     """The continuous-time trim, without the torque that turning takes: the initial guess of Newton's method."""
     level, zero = np.array([1.0, 0.0, 0.0, 0.0], np.float32), np.zeros(3, np.float32)
     if not isinstance(reward := task.reward, CircleReward):
-        return Trim(zero, zero, level, zero, np.zeros(4, np.float32))
+        return Trim(zero, zero, level, zero, np.zeros(len(task.vehicle.motors), np.float32))
     turn_rate = reward.speed_m_s / reward.radius_m
     roll = -np.arctan2(turn_rate * reward.speed_m_s, STANDARD_GRAVITY_M_S2)  # about body x, which is along the circle
     c, s = np.cos(roll / 2) * np.sqrt(0.5), np.sin(roll / 2) * np.sqrt(0.5)

@@ -131,7 +131,7 @@ def _costs(policy: Policy, measured: Measured, name: str) -> Iterable[str]:
     yield "## Costs\n"
     costs = measured.verification.costs
     if not costs:
-        yield "Not measured: this needs the Arm compiler and QEMU (above).\n"
+        yield "Not measured: this needs cross compilers and QEMU (above).\n"
         return
     yield "Instructions per inference under QEMU: mean of inputs in range (maximum over all vectors).\n"
     yield f"| core | `{name}_step` | `{name}_step_i16` |\n|---|---|---|"

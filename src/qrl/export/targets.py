@@ -1,4 +1,4 @@
-"""Compiles an emitted kernel and runs it on the host and, with instruction counts, on four Cortex-M under QEMU.
+"""Compiles an emitted kernel and runs it on the host and, with instruction counts, on `CORES` under QEMU.
 
 A kernel is given by the path of its NAME.c; NAME.h is beside it. `harness/harness.c` runs both entry points over files
 of observations, writes all outputs and states to a file, and prints one result line at the end. A run without exactly
@@ -43,13 +43,25 @@ typedef {name}_state kernel_state;
 """
 
 
+class Toolchain(NamedTuple):
+    """What compiles for a family of cores and runs it."""
+
+    family: str
+    prefix: str  # of the compiler's tools
+    emulator: str
+    sources: tuple[str, str]  # of the harness: its platform and its linker script
+    library: str  # a file of the C library that it needs
+
+
 class Core(NamedTuple):
     """A QEMU machine, and what is assumed of a common chip with that core."""
 
     name: str
+    toolchain: Toolchain
     machine: str
     flags: tuple[str, ...]
-    tick: float  # instructions per tick of its SysTick under `-icount shift=0`
+    tick: float  # instructions per tick of its counter under `-icount shift=0`
+    origins: tuple[int, int]  # addresses of flash and RAM
     flash_bytes: int
     ram_bytes: int
     clock_MHz: int
@@ -58,11 +70,27 @@ class Core(NamedTuple):
 
 _KIB, _MIB = 1 << 10, 1 << 20
 _HARD = ("-mfloat-abi=hard", "-mthumb")
+CORTEX_M = Toolchain(
+    "Cortex-M", "arm-none-eabi-", "qemu-system-arm", ("cortex_m.c", "cortex_m.ld"), "libc.a"
+)  # fmt: skip
+RISC_V = Toolchain(
+    "RISC-V", "riscv64-unknown-elf-", "qemu-system-riscv32", ("risc_v.c", "risc_v.ld"), "picolibc.specs"
+)  # fmt: skip
+_M4, _M7, _M33 = (
+    (f"-mcpu=cortex-{name}", f"-mfpu={fpu}-sp-d16", *_HARD)
+    for name, fpu in (("m4", "fpv4"), ("m7", "fpv5"), ("m33", "fpv5"))
+)
+_RV32IMC = ("-march=rv32imc", "-mabi=ilp32", "-specs=picolibc.specs")
+_LOW, _SECURE, _HIGH = (0, 0x2000_0000), (0x1000_0000, 0x3800_0000), (0x8000_0000, 0x8040_0000)
+_BIG = (4 * _MIB, 4 * _MIB)
 CORES = (
-    Core("M0", "microbit", ("-mcpu=cortex-m0", "-mthumb"), 62.5, 256 * _KIB, 16 * _KIB, 48, 1.5),
-    Core("M3", "mps2-an385", ("-mcpu=cortex-m3", "-mthumb"), 40.0, 4 * _MIB, 4 * _MIB, 72, 1.5),
-    Core("M4F", "mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB, 168, 1.3),
-    Core("M7", "mps2-an500", ("-mcpu=cortex-m7", "-mfpu=fpv5-sp-d16", *_HARD), 40.0, 4 * _MIB, 4 * _MIB, 480, 1.0),
+    Core("M0", CORTEX_M, "microbit", ("-mcpu=cortex-m0", "-mthumb"), 62.5, _LOW, 256 * _KIB, 16 * _KIB, 48, 1.5),
+    Core("M3", CORTEX_M, "mps2-an385", ("-mcpu=cortex-m3", "-mthumb"), 40.0, _LOW, *_BIG, 72, 1.5),
+    Core("M4F", CORTEX_M, "mps2-an386", _M4, 40.0, _LOW, *_BIG, 168, 1.3),
+    Core("M7", CORTEX_M, "mps2-an500", _M7, 40.0, _LOW, *_BIG, 480, 1.0),
+    Core("M33", CORTEX_M, "mps2-an505", _M33, 50.0, _SECURE, 4 * _MIB, 2 * _MIB, 150, 1.3),
+    Core("M55", CORTEX_M, "mps3-an547", ("-mcpu=cortex-m55", *_HARD), 31.25, _LOW, 512 * _KIB, 512 * _KIB, 160, 1.2),
+    Core("RV32IMC", RISC_V, "virt", _RV32IMC, 1.0, _HIGH, *_BIG, 160, 1.3),
 )
 
 
@@ -94,15 +122,16 @@ def host_compiler() -> str | None:
     return shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 
 
-def missing_tools() -> list[str]:
-    """Tools that `run_core` and `size` need and this machine does not have."""
-    tools = "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"
+def missing_tools(toolchain: Toolchain) -> list[str]:
+    """Tools that `run_core` and `size` need for its cores and this machine does not have."""
+    compiler = f"{toolchain.prefix}gcc"
+    tools = compiler, f"{toolchain.prefix}size", toolchain.emulator
     missing = [tool for tool in tools if not shutil.which(tool)]
-    if "arm-none-eabi-gcc" not in missing:
-        command = ["arm-none-eabi-gcc", "-print-file-name=libc.a"]
+    if compiler not in missing:
+        command = [compiler, f"-print-file-name={toolchain.library}"]
         library = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-        if not Path(library).is_absolute():  # the compiler names a library that it does not have without a folder
-            missing.append("newlib (libnewlib-arm-none-eabi)")
+        if not Path(library).is_absolute():  # the compiler names a file that it does not have without a folder
+            missing.append(f"{toolchain.library} of a C library for {compiler}")
     return missing
 
 
@@ -123,14 +152,19 @@ def run_core(
     core: Core, kernel: Path, work: Path, flags: Sequence[str], given: Observations, libraries: Sequence[str] = ()
 ) -> tuple[Outputs, Counts]:
     """Outputs and costs of `kernel` on `core`; linked with libc, libgcc and `libraries` only."""
-    folder = _folder(kernel, work, core.name, given)
-    memory = [f"-Wl,--defsym=FLASH_BYTES={core.flash_bytes}", f"-Wl,--defsym=RAM_BYTES={core.ram_bytes}"]
-    link = ["-nostdlib", "-T", str(SOURCES / "cortex_m.ld"), *memory, *libraries, "-lc", "-lgcc"]
-    sources = _sources(kernel, folder, "startup.c")
-    _build(["arm-none-eabi-gcc", *core.flags, *flags, *sources, *link, "-o", "kernel.elf"], folder, core.name)
-    qemu = ["qemu-system-arm", "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
+    tools, folder = core.toolchain, _folder(kernel, work, core.name, given)
+    platform, script = tools.sources
+    values = dict(zip(("FLASH", "RAM"), core.origins, strict=True))
+    symbols = {f"{name}_ORIGIN": value for name, value in values.items()}
+    symbols |= {"FLASH_BYTES": core.flash_bytes, "RAM_BYTES": core.ram_bytes}
+    memory = [f"-Wl,--defsym={name}={value}" for name, value in symbols.items()]
+    link = ["-nostdlib", "-T", str(SOURCES / script), *memory, *libraries, "-lc", "-lgcc"]
+    sources = _sources(kernel, folder, platform)
+    _build([f"{tools.prefix}gcc", *core.flags, *flags, *sources, *link, "-o", "kernel.elf"], folder, core.name)
+    qemu = [tools.emulator, "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
     semihosting = ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native"]
-    output = _run([*qemu, *semihosting, "-kernel", "kernel.elf"], folder, core.name)
+    image = ["-bios", "none"] if tools is RISC_V else []
+    output = _run([*qemu, *semihosting, *image, "-kernel", "kernel.elf"], folder, core.name)
     outputs, fields, elapsed = _read(folder, core.name, kernel.stem, output, given)
     return outputs, _counts(core, fields, elapsed)
 
@@ -138,16 +172,16 @@ def run_core(
 def size(core: Core, kernel: Path, work: Path) -> Sizes:
     """Size of the object file of `kernel` on `core`, and of the library code that it needs."""
     folder = Path(tempfile.mkdtemp(prefix=f"{core.name}-size-", dir=work))
-    compiler = ["arm-none-eabi-gcc", *core.flags]
+    compiler = [f"{core.toolchain.prefix}gcc", *core.flags]
     _build([*compiler, *RELEASE, "-c", str(kernel.resolve()), "-o", "kernel.o"], folder, core.name)
     entry = ["-nostdlib", f"-Wl,--entry={kernel.stem}_step"]
     _build([*compiler, *entry, "kernel.o", "-lc", "-lgcc", "-o", "linked.elf"], folder, core.name)
-    (text, data, bss), linked = (_sections(folder / name, core.name) for name in ("kernel.o", "linked.elf"))
+    (text, data, bss), linked = (_sections(core, folder / name) for name in ("kernel.o", "linked.elf"))
     return Sizes(text, data, bss, max(0, linked[0] - text))
 
 
-def _sections(path: Path, where: str) -> list[int]:
-    table = _build(["arm-none-eabi-size", path.name], path.parent, where)
+def _sections(core: Core, path: Path) -> list[int]:
+    table = _build([f"{core.toolchain.prefix}size", path.name], path.parent, core.name)
     return [int(number) for number in table.splitlines()[1].split()[:3]]
 
 
@@ -264,5 +298,5 @@ def check_clock(core: Core, measured: dict[int, float]) -> None:
         if abs(instructions - known_instructions(rounds)) > CLOCK_ERROR:
             raise VerificationFailed(
                 f"{core.name}: a loop of {known_instructions(rounds)} instructions was measured as {instructions:g}:"
-                f" SysTick does not tick every {core.tick:g} instructions here"
+                f" its counter does not tick every {core.tick:g} instructions here"
             )
