@@ -29,7 +29,7 @@ define HELP
   make export RUN=runs/circle        a C kernel for a microcontroller in RUN/export, verified bit for bit
        NAME=hover                      prefix of all its names in C (default qrl_TASK)
   make view RUN=runs/circle          flights of it in 3D as one HTML page, RUN/view.html, to open in a browser
-       ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE
+       ARGS="--starts 12 900"          which of evaluate's starts, by index; --out FILE; --kernel: its flights, too
   make fly VEHICLE=mine.json         a policy that ships and flies any quadrotor, with yours: evaluate and view
        REFERENCE=eight                 what to follow; RUN=any: which run; ARGS="--starts 1000 --off-nominal"
   make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; rerun to resume

@@ -25,8 +25,10 @@ from selenium.webdriver.support.ui import Select
 from cli_helpers import TINY, complaint, qrl
 from cross_targets import need
 from experiments.gallery import browser
+from qrl.cli.export import fly_kernel
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun
+from qrl.export.quantize import quantize
 from qrl.runs import files
 from qrl_envs import measures, viewer
 from qrl_envs import task as tasks
@@ -120,6 +122,19 @@ def test_the_page_holds_the_flights(name: str) -> None:
         np.testing.assert_allclose(np.transpose(last), thrust, atol=5e-3)
 
 
+@each_task
+def test_the_kernels_flights_are_beside(name: str) -> None:
+    task, flown, other = tasks.load(name), made_up(name), made_up(name, seed=1)
+    data = data_of(viewer.page(task, "mine", flown._replace(beside=other.observations)))
+    alone = data_of(viewer.page(task, "mine", other))
+    for flight, same in zip(data["flights"], alone["flights"], strict=True):
+        for panel, known in zip(flight["panels"][:-1], same["panels"][:-1], strict=True):
+            np.testing.assert_allclose(column(panel[1]), column(known[0]), atol=2e-3)
+        if name != "pendulum":
+            assert flight["beside_m"] == same["position_m"]
+    assert [line["name"] for line in data["panels"][0]["lines"]] == ["float", "kernel"]
+
+
 def test_the_speed_of_a_clockwise_circle_has_an_axis_the_right_way_up() -> None:
     wanted = {"reward": {"speed_m_s": -2.0}}
     task = tasks.from_data({"extend": "circle", **wanted, "evaluation": wanted}, "mine")
@@ -208,6 +223,16 @@ def test_the_flights_are_those_of_evaluate(trained: Path, tmp_path: Path) -> Non
         np.testing.assert_allclose(flight["panels"][-1][0], 2.0 * flights.actions[flight["start"], :, 0], atol=3e-3)
     saved = max(int(path.name) for path in (run / "checkpoints").iterdir())
     assert data["title"] == f"pendulum, seed 0, step {saved:,}"
+
+
+def test_the_kernel_is_that_of_an_export(trained: Path, tmp_path: Path) -> None:
+    run = shutil.copytree(trained, tmp_path / "run")
+    data = view(run, "--starts", "917", "--kernel")
+    steps = TrainedRun.load(run)
+    flights = fly_kernel(steps, policy := steps.policy(), quantize(policy), evaluation_starts()[np.full(8, 917)])
+    seen, (flight,) = flights.observations[0], data["flights"]
+    np.testing.assert_allclose(flight["panels"][1][1], seen[:, 2], atol=1e-3)
+    assert np.abs(np.array(flight["panels"][1][0]) - seen[:, 2]).max() > 0  # not the float policy's
 
 
 def test_starts_that_fail_come_first(trained: Path, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ class Recording(NamedTuple):
     starts: Sequence[int]  # [n] their indices, as labels
     observations: np.ndarray  # [n, K + 1, F] SI units; NaN after an early end
     actions: np.ndarray  # [n, K, A] in [−1, 1]
+    beside: np.ndarray | None = None  # [n, K + 1, F] of the int8 kernel, from the same starts
 
 
 class Line(NamedTuple):
@@ -76,20 +77,23 @@ def _data(task: Task, title: str, recording: Recording) -> dict[str, Any]:
     """The data of the scripts. Non-finite numbers are null."""
     observations = np.asarray(recording.observations, float)
     n, samples, _ = observations.shape
-    stride = -(-n * samples // MAX_SAMPLES)
+    stride = -(-n * samples * (1 if recording.beside is None else 2) // MAX_SAMPLES)
     found = measures.of_flights(task, recording.observations)
     actions = _in_units(task, np.asarray(recording.actions, float))
+    beside = None if recording.beside is None else np.asarray(recording.beside, float)
     if isinstance(task, PendulumTask):
-        world, panels = _rod(task), _pendulum_panels(task, observations, actions)
+        world, panels = _rod(task), _pendulum_panels(task, observations, actions, beside)
         motion = {"angle_rad": _plain(np.arctan2(observations[..., 1], observations[..., 0])[:, ::stride], 1e-4)}
     else:
         there = measures.in_world(task, observations)
-        world, panels = _vehicle(task, samples, stride), _quadrotor_panels(task, there, actions, found)
+        world, panels = _vehicle(task, samples, stride), _quadrotor_panels(task, there, actions, found, beside)
         motion = {  # [n, 3, samples], as the scene needs them
             "position_m": _plain(there[:, ::stride, 9:12].swapaxes(1, 2), 1e-4),
             "forward": _plain(observations[:, ::stride, [0, 3, 6]].swapaxes(1, 2), 1e-4),
             "up": _plain(observations[:, ::stride, [2, 5, 8]].swapaxes(1, 2), 1e-4),
         }
+        if beside is not None:
+            motion["beside_m"] = _plain(measures.in_world(task, beside)[:, ::stride, 9:12].swapaxes(1, 2), 1e-4)
     columns = [[_plain(line.values[:, ::stride], panel.resolution) for line in panel.lines] for panel in panels]
     finite = np.all(np.isfinite(observations), axis=2)
     lengths = np.where(np.all(finite, axis=1), samples, np.argmin(finite, axis=1))  # up to the first non-finite sample
@@ -203,21 +207,38 @@ def _rod(task: PendulumTask) -> dict[str, Any]:
 # Quantities over time; the actions come last, and the scene shows them too
 
 
+def _both(values: np.ndarray, beside: np.ndarray | None) -> list[Line]:
+    """A quantity of the policy's flights, and of the kernel's where they are there."""
+    if beside is None:
+        return [Line("", BLUE, values)]
+    return [Line("float", BLUE, values), Line("kernel", ORANGE, beside, "the int8 kernel")]
+
+
+def _motion(task: QuadrotorTask, there: np.ndarray, found: Measured) -> tuple[np.ndarray, np.ndarray]:
+    """The distance [m] to where the task wants a vehicle, and its speed [m/s]; on a circle along it. [n, K + 1]"""
+    wanted, error = task.evaluation.reward, found.errors
+    if isinstance(wanted, CircleReward) and task.evaluation.speed_m_s is not None:
+        return np.hypot(error["radius_m"], error["height_m"]), error["speed_m_s"] + wanted.speed_m_s
+    return error["position_m"], np.linalg.norm(there[..., 12:15], axis=-1)
+
+
 def _quadrotor_panels(
-    task: QuadrotorTask, observations: np.ndarray, actions: np.ndarray, found: Measured
+    task: QuadrotorTask, there: np.ndarray, actions: np.ndarray, found: Measured, beside: np.ndarray | None
 ) -> list[Panel]:
-    spec, wanted, error = task.evaluation, task.evaluation.reward, found.errors
+    spec, wanted = task.evaluation, task.evaluation.reward
+    distance, speed = _motion(task, there, found)
+    other = None, None
+    if beside is not None:
+        other = _motion(task, measures.in_world(task, beside), measures.of_flights(task, beside))
     if isinstance(wanted, CircleReward) and spec.speed_m_s is not None:
-        target, distance = "circle", np.hypot(error["radius_m"], error["height_m"])
-        label, speed = "tangential speed", error["speed_m_s"] + wanted.speed_m_s
+        target, label = "circle", "tangential speed"
         band = wanted.speed_m_s - spec.speed_m_s, wanted.speed_m_s + spec.speed_m_s
         lowest, highest = sorted((-wanted.speed_m_s, 3.0 * wanted.speed_m_s))
         beyond = 1.5 * wanted.speed_m_s  # below 0 for a clockwise circle
         limits = max(lowest, _least(speed, min(0.0, beyond))), min(highest, _most(speed, max(0.0, beyond)))
     else:
         target = "reference" if spec.reference else "target"
-        distance, band = error["position_m"], None
-        label, speed = "speed", np.linalg.norm(observations[..., 12:15], axis=-1)
+        label, band = "speed", None
         limits = 0.0, _most(speed)
     least = (0.1 if spec.reference else 1.0) * MIN_SHOWN * spec.distance_m
     rotor_speed = task.action == "rotor_speed"
@@ -225,9 +246,9 @@ def _quadrotor_panels(
     acted = ("rotor speed, of its greatest", "rotor speed", "1") if rotor_speed else ("thrust", "thrust", "N")
     thrusts = [line._replace(values=actions[..., i]) for i, line in enumerate(_motors(task))]
     return [
-        Panel(label, "speed", "m/s", [Line("", BLUE, speed)], _roomy(*limits), 1e-3, 2, band),
+        Panel(label, "speed", "m/s", _both(speed, other[1]), _roomy(*limits), 1e-3, 2, band),
         Panel(
-            *(f"distance to the {target}", "distance", "m", [Line("", BLUE, distance)]),
+            *(f"distance to the {target}", "distance", "m", _both(distance, other[0])),
             limits=(least, 1.3 * max(_most(distance), 10.0 * spec.distance_m)),
             resolution=1e-3 * least,
             decimals=3,
@@ -245,11 +266,18 @@ def _quadrotor_panels(
     ]
 
 
-def _pendulum_panels(task: PendulumTask, observations: np.ndarray, actions: np.ndarray) -> list[Panel]:
-    spec, rod = task.evaluation, task.rod
+def _angle_rad(observations: np.ndarray) -> np.ndarray:
+    """Angles from upright without jumps, [n, K + 1]; of flights that come upright the end is at zero."""
     angle = np.unwrap(np.arctan2(observations[..., 1], observations[..., 0]), axis=1)
     last = [each[np.isfinite(each)][-1:].sum() for each in angle]
-    angle -= 2.0 * np.pi * np.round(np.array(last) / (2.0 * np.pi))[:, None]  # flights that come upright end at zero
+    return angle - 2.0 * np.pi * np.round(np.array(last) / (2.0 * np.pi))[:, None]
+
+
+def _pendulum_panels(
+    task: PendulumTask, observations: np.ndarray, actions: np.ndarray, beside: np.ndarray | None
+) -> list[Panel]:
+    spec, rod = task.evaluation, task.rod
+    angle, other = _angle_rad(observations), None if beside is None else _angle_rad(beside)
     limits = min(-np.pi, _least(angle)), max(np.pi, _most(angle))
     turns = np.arange(np.ceil(limits[0] / np.pi), np.floor(limits[1] / np.pi) + 1.0)
     ticks = tuple((float(turn * np.pi), _in_pi(int(turn))) for turn in turns)
@@ -257,10 +285,17 @@ def _pendulum_panels(task: PendulumTask, observations: np.ndarray, actions: np.n
     most_rate, most_torque = rod.max_rate_rad_s, rod.max_torque_N_m
     rate, torque = observations[..., 2], Line("", ORANGE, actions[..., 0])
     return [
+        Panel("angle from upright", "angle", "rad", _both(angle, other), _roomy(*limits), 1e-4, 2, angles, ticks=ticks),
         Panel(
-            "angle from upright", "angle", "rad", [Line("", BLUE, angle)], _roomy(*limits), 1e-4, 2, angles, ticks=ticks
+            "rate",
+            "rate",
+            "rad/s",
+            _both(rate, None if beside is None else beside[..., 2]),
+            _roomy(-most_rate, most_rate),
+            1e-3,
+            2,
+            rates,
         ),
-        Panel("rate", "rate", "rad/s", [Line("", BLUE, rate)], _roomy(-most_rate, most_rate), 1e-3, 2, rates),
         Panel("torque", "torque", "N m", [torque], _roomy(-most_torque, most_torque), 5e-4 * most_torque, 2, held=True),
     ]
 

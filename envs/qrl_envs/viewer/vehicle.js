@@ -140,6 +140,7 @@ function vehicleScene(div, page, onCamera) {
       ...(wanted.path_m ? [{ type: "scatter3d", mode: "markers", x: m.x[5], y: m.y[5], z: m.z[5], hoverinfo: "skip", marker: { color: "#007a59", size: 6, symbol: "diamond" } }] : []),
       line3d(X, Y, floor, { color: "#dcdfe3", width: 3 }),
     ];
+    if (flight.beside_m) all.push(line3d(...flight.beside_m, { color: "#D55E00", width: 3 }));
     if (wanted.path_m) {
       const [x, y, z] = wanted.path_m, off = flight.panels[1][0];
       const color = off.map(e => Math.min(LOG_MOST, Math.max(LOG_LEAST, Math.log10(e || 1e-9))));
@@ -236,7 +237,8 @@ function vehicleScene(div, page, onCamera) {
       const target = wanted.radius_m ? "circle" : "target", { name, unit } = page.acted;
       const shown = wanted.path_m ? ` green: the reference, dashed; trail: blue 1 mm off it, red ${wanted.tolerance_m} m`
         : ` green: within ${wanted.tolerance_m} m of the ${target}`;
-      return `${size}, black nose forward; ${name} bars: ${metres.toPrecision(2)} m is ${most.toPrecision(3)} ${unit};${shown}`;
+      const beside = flight.beside_m ? " orange: the int8 kernel;" : "";
+      return `${size}, black nose forward; ${name} bars: ${metres.toPrecision(2)} m is ${most.toPrecision(3)} ${unit};${beside}${shown}`;
     },
     probe: now => placed(now).map(values => values[0]),
   };

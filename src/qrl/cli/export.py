@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import chex
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,10 +79,7 @@ def export_run(
     name = kernel_name(run, name)
     log("flying to calibrate")
     policy = run.policy()
-    try:
-        kernel = quantize(policy)
-    except UnsupportedNetwork as error:
-        raise BadInput(f"{run.folder}: {error}") from None
+    kernel = integer_kernel(run, policy)
     target = run.folder / "export"
     with TemporaryDirectory(dir=run.folder, prefix=".export-") as scratch, ThreadPoolExecutor(1) as pool:
         folder = Path(scratch) / "export"
@@ -102,6 +100,14 @@ def export_run(
     return measured
 
 
+def integer_kernel(run: TrainedRun, policy: Policy) -> Kernel:
+    """The kernel of a run's policy in integers; BadInput for a network that it cannot represent."""
+    try:
+        return quantize(policy)
+    except UnsupportedNetwork as error:
+        raise BadInput(f"{run.folder}: {error}") from None
+
+
 def _write(folder: Path, files: dict[str, str]) -> None:
     for name, text in files.items():
         path = folder / name
@@ -113,16 +119,8 @@ def _measured(
     run: TrainedRun, policy: Policy, kernel: Kernel, starts: int, verification: Callable[[], VerificationReport]
 ) -> Measured:
     """Fly both policies from the starts of an evaluation, then wait for the verification."""
-
-    def integer(state: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
-        """The kernel has the measured observation only, and keeps its own memory."""
-        after, _, action = reference.step(kernel, state.astype(np.int64), observation[:, :measured])
-        return after, action
-
-    measured = len(policy.observations)
     keys = evaluation_starts(starts)
-    float_flights = run.fly(keys)
-    integer_flights = run.fly_host_policy(integer, reference.initial_state(kernel, starts), keys)
+    float_flights, integer_flights = run.fly(keys), fly_kernel(run, policy, kernel, keys)
     # Every step of the transient, where the errors are; the observations of a settled vehicle repeat.
     inputs = flown_inputs(policy, float_flights)
     transient = 2 * calibration.TRANSIENT_STEPS
@@ -136,6 +134,17 @@ def _measured(
         integer_flights=_stats(policy, integer_flights, tail),
         verification=verification(),
     )
+
+
+def fly_kernel(run: TrainedRun, policy: Policy, kernel: Kernel, starts: chex.PRNGKey) -> Flights:
+    """Flights of the integer reference, whose bits are the kernel's, in the environment of `run`."""
+
+    def step(state: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
+        """It has the measured observation only, and keeps its own memory."""
+        after, _, action = reference.step(kernel, state.astype(np.int64), observation[:, : len(policy.observations)])
+        return after, action
+
+    return run.fly_host_policy(step, reference.initial_state(kernel, len(starts)), starts)
 
 
 def _stats(policy: Policy, flights: Flights, tail_steps: int) -> FlightStats:

@@ -10,4 +10,4 @@ def fly(args: argparse.Namespace) -> int:
     """As `qrl evaluate` and then `qrl view`."""
     both = {"run": args.run, "vehicle": args.vehicle, "reference": args.reference}
     evaluate(argparse.Namespace(**both, starts=args.starts, checkpoints=1, off_nominal=args.off_nominal, beside=[]))
-    return view(argparse.Namespace(**both, starts=None, out=None))
+    return view(argparse.Namespace(**both, starts=None, out=None, kernel=args.kernel))

@@ -124,6 +124,8 @@ def build_parser() -> _Parser:
     export.add_argument("--name", metavar="NAME", help=name)
     chosen = "indices among evaluate's 1,000 starts (default: eight, failed ones first)"
     view.add_argument("--starts", type=whole_number, nargs="+", metavar="N", help=chosen)
+    for command in (view, fly):
+        command.add_argument("--kernel", action="store_true", help="show the int8 kernel's flights beside the policy's")
     view.add_argument("--out", type=Path, metavar="FILE", help="HTML file (default RUN/view.html)")
 
     identify = commands.add_parser("identify", help="fit a vehicle's file to logs of its flights")

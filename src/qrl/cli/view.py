@@ -5,13 +5,16 @@ import json
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from qrl import tasks
+from qrl.cli.export import fly_kernel, integer_kernel
 from qrl.cli.terminal import DONE, console
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import STARTS, evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import files, record
+from qrl.training import devices
 from qrl_envs import viewer
 from qrl_envs.specfile import BadInput
 from qrl_envs.viewer import Recording
@@ -24,6 +27,8 @@ LANES = 8  # the number of starts is a multiple, so that few numbers of starts a
 
 def view(args: argparse.Namespace) -> int:
     """Fly a few starts of `qrl evaluate` with every seed of a run; write view.html to each folder."""
+    if args.kernel:
+        devices.configure_callbacks()
     config = tasks.load_run_config(args.run)
     config = config.model_copy(update={"task": tasks.following(config.task, args.reference, args.vehicle)})
     if not config.task.spec:
@@ -43,11 +48,23 @@ def view(args: argparse.Namespace) -> int:
         observations, actions = (np.asarray(x[: len(starts)]) for x in (flights.observations, flights.actions))
         flown = "".join(f", {given}" for given in (args.vehicle, args.reference) if given is not None)
         title = f"{config.task.name}{flown}, seed {run.config.seed}, step {run.env_steps:,}"
-        page = viewer.page(task, title, Recording(starts, observations, actions))
+        beside = _kernel_observations(folder, run, padded)[: len(starts)] if args.kernel else None
+        page = viewer.page(task, title, Recording(starts, observations, actions, beside))
         path = args.out or folder / "view.html"
         files.replace_text(path, page)
         console.print(f"{path}: {len(starts)} flights, {len(page.encode()) / 1e6:.1f} MB; open it in a browser")
     return DONE
+
+
+def _kernel_observations(folder: Path, run: TrainedRun, starts: NDArray[np.integer]) -> NDArray[np.floating]:
+    """The observations of its exported kernel's flights; [n, K + 1, F].
+
+    Its numbers are those of `qrl export`, also where another vehicle or reference is flown here.
+    """
+    own = TrainedRun.load(folder)
+    policy = own.policy()
+    flights = fly_kernel(run, policy, integer_kernel(own, policy), evaluation_starts()[starts])
+    return np.asarray(flights.observations)
 
 
 def _requested(starts: list[int]) -> list[int]:
