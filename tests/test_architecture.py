@@ -36,7 +36,7 @@ ROOMS: dict[str, dict[str, Room]] = {
         "api": Room({"cli", "tasks", "evaluation", "algorithm", "runs", "config"}, MATHS | INPUT | {"pydantic"}),
         "__main__": Room({"cli"}, set()),
         "config": Room(set(), {"pydantic", "numpy"} | INPUT),
-        "export": Room(set(), {"numpy"}),
+        "export": Room(set(), {"numpy", "onnx"}),
         "algorithm": Room({"config"}, MATHS | {"flax", "optax"}),
         "runs": Room({"config"}, MATHS | INPUT | {"orbax", "pydantic", "matplotlib", "tensorboardX"}),
         "training": Room({"runs", "algorithm", "config"}, MATHS | INPUT),

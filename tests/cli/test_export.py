@@ -26,7 +26,13 @@ from qrl_envs.task import QuadrotorTask
 from qrl_envs.vehicle import shipped_vehicles
 
 LEAST = ("--starts", "8", "--vectors", "500")
-FILES = policies.emitted_files("qrl_pendulum") | {"report.md"}
+
+
+def exported_files(name: str) -> set[str]:
+    return policies.emitted_files(name) | {"report.md", f"{name}.onnx", f"{name}.npz"}
+
+
+FILES = exported_files("qrl_pendulum")
 
 
 @pytest.fixture(autouse=True)
@@ -138,7 +144,7 @@ def test_a_foreign_environment_exports(
     assert [port["name"] for port in manifest["obs"]] == ["o0", "o1"]
     assert [(port["name"], port["unit"]) for port in manifest["act"]] == [("a0", "?")]
     assert manifest["control_period_s"] == 0.02
-    assert set(contents(run / "export")) == policies.emitted_files("qrl_fast") | {"report.md"}
+    assert set(contents(run / "export")) == exported_files("qrl_fast")
 
 
 def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
@@ -282,7 +288,7 @@ def test_an_export_has_the_name_that_is_given(run: Path, capsys: pytest.CaptureF
     assert qrl("export", run, *LEAST) == 0
     assert qrl("export", run, *LEAST, "--name", "swing_up") == 0
     assert f"{run}/export/swing_up.c" in capsys.readouterr().out
-    assert set(contents(run / "export")) == policies.emitted_files("swing_up") | {"report.md"}
+    assert set(contents(run / "export")) == exported_files("swing_up")
     manifest = json.loads((run / "export" / "manifest.json").read_text())
     assert (manifest["format"], manifest["name"], manifest["state_bytes"]) == (2, "swing_up", 1)
     assert (manifest["vehicle"], manifest["memory"]) == (None, None)

@@ -76,6 +76,8 @@ def export_run(
     Raises BadInput for a network that the kernel cannot represent, AccumulatorOverflow and VerificationFailed; the
     previous `export` is then unchanged. `name`: as `kernel_name` takes it.
     """
+    from qrl.export import portable  # ONNX takes a second to import, and other commands import this file
+
     name = kernel_name(run, name)
     log("flying to calibrate")
     policy = run.policy()
@@ -84,6 +86,8 @@ def export_run(
     with TemporaryDirectory(dir=run.folder, prefix=".export-") as scratch, ThreadPoolExecutor(1) as pool:
         folder = Path(scratch) / "export"
         _write(folder, emit.files(policy, kernel, vectors.golden(policy, kernel), name))
+        (folder / f"{name}.onnx").write_bytes(portable.onnx_model(policy))
+        (folder / f"{name}.npz").write_bytes(portable.arrays(policy))
         log("compiling and verifying; flying")
         verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)

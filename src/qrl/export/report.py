@@ -169,5 +169,6 @@ Add `{name}.h` and `{name}.c` to the firmware: C99, no libm, no heap, no static 
 - Call `{name}_selftest()` at boot and do not fly unless it returns 0; `{name}_reset(&state)` before the first step and
   whenever the policy takes up control again.
 - All names begin with `{name}`: any number of exports of different names link into one firmware.
+- `{name}.onnx`: the float policy, for runtimes of ONNX. `{name}.npz`: its numbers, for NumPy.
 - `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.
 """
