@@ -22,7 +22,7 @@ from qrl_envs.vehicle import Vehicle
 
 SHIM = Path(__file__).parent / "crazyflie_shim.c"
 STEP_S = 0.001  # of the stabilizer
-STRICT = ("-std=gnu11", "-Wall", "-Wextra", "-Werror")
+STRICT = ("-Wall", "-Wextra", "-Werror")
 IN, OUT = 32, 6
 POLICY = 1  # `qrl.state`
 # M1 to M4: body x and y are of these signs (documentation of the Crazyflie 2.1, beside its firmware).
@@ -46,7 +46,11 @@ class Mutant(NamedTuple):
 
 
 def build(app: Path, firmware: Firmware, out: Path, *mutants: Mutant) -> Path:
-    """The library `out` of the app in the folder `crazyflie/` of an export; ValueError if a mutant's text is not in it."""
+    """The library `out` of the app in the folder `crazyflie/` of an export; ValueError if a mutant's text is not in it.
+
+    Without mutants, a warning fails, and the kernel and the firmware's sources are compiled; with them, those of the same
+    folder as `out` are linked.
+    """
     source = next(app.glob("src/*_controller.c"))
     text = source.read_text(encoding="utf-8")
     for mutant in mutants:
@@ -54,18 +58,17 @@ def build(app: Path, firmware: Firmware, out: Path, *mutants: Mutant) -> Path:
             raise ValueError(f"not in {source}: {mutant.old}")
         text = text.replace(mutant.old, mutant.new)
     out.parent.mkdir(parents=True, exist_ok=True)
-    mutated = out.with_suffix(".c")
+    mutated, kernel, stock = out.with_suffix(".c"), out.with_name("kernel.o"), out.with_name("stock.o")
     mutated.write_text(text, encoding="utf-8")
-    kernel = source.with_name(source.name.replace("_controller", ""))
     includes = [f"-I{folder}" for folder in (source.parent, *firmware.includes)]
-    warnings = ("-w",) if mutants else STRICT[1:]
-    shared = ("gcc", STRICT[0], "-O1", "-shared", "-fPIC", *firmware.flags, *includes, f'-DAPP="{mutated}"')
-    others = [str(path) for path in (kernel, *firmware.sources)]
-    objects = []
-    if firmware.sources:  # theirs, whose warnings are not ours
-        objects = [str(out.with_suffix(".stock.o"))]
-        _run("gcc", STRICT[0], "-O1", "-r", "-nostdlib", "-w", "-fPIC", *firmware.flags, *includes, *others[1:], "-o", *objects)
-    _run(*shared, *warnings, str(SHIM), others[0], *objects, "-lm", "-o", str(out))
+    common = ("gcc", "-std=gnu11", "-fPIC", *firmware.flags, *includes)
+    if not mutants:
+        _run(*common, "-O2", *STRICT, "-c", str(source), "-o", str(out.with_name("app.o")))
+        _run(*common, "-O2", *STRICT, "-c", str(source.with_name(source.name.replace("_controller", ""))), "-o", str(kernel))
+        if firmware.sources:  # theirs, whose warnings are not ours
+            _run(*common, "-O1", "-w", "-r", "-nostdlib", *map(str, firmware.sources), "-o", str(stock))
+    objects = [str(kernel), *([str(stock)] if firmware.sources else [])]
+    _run(*common, "-O0", "-w", "-shared", f'-DAPP="{mutated}"', str(SHIM), *objects, "-lm", "-o", str(out))
     return out
 
 

@@ -43,12 +43,12 @@ bool controllerPidTest(void) {
 
 void controllerPid(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state,
                    const stabilizerStep_t step) {
-    (void)sensors, (void)state;
+    const float sum = state->position.x + state->velocity.y + state->attitudeQuaternion.w + sensors->gyro.z;
     control->controlMode = controlModeLegacy;
     if (step % 2 == 0) {
         control->roll = control->pitch = control->yaw = 0;
     }
-    control->thrust = setpoint->mode.z == modeAbs ? 30000.0f : 0.0f;
+    control->thrust = setpoint->mode.z == modeAbs && isfinite(sum) ? 30000.0f : 0.0f;
 }
 
 void powerDistribution(const control_t *control, motors_thrust_uncapped_t *thrust) {

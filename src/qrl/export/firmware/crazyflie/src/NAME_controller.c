@@ -48,7 +48,7 @@ enum {
     STOCK_SETPOINT_OLD = 3, /* none for qrl.setpointMs */
     /* Faults: until qrl.arm is set to 0. */
     STOCK_STATE_OLD = 4,   /* the estimate has not changed for qrl.stateMs */
-    STOCK_NOT_FINITE = 5,  /* of the state, the gyro or the set-point; or its quaternion is none */
+    STOCK_NOT_FINITE = 5,  /* the state, the gyro or the set-point; or the quaternion is none */
     STOCK_SELFTEST = 6,    /* this build does not compute the policy that was verified */
 };
 
@@ -63,6 +63,8 @@ static uint32_t last_step, next_step, changed_step;
 
 static quaternion_t seen_attitude; /* of the estimate when it last changed */
 static velocity_t seen_velocity;
+static state_t last_state; /* the last that were finite */
+static sensorData_t last_sensors;
 
 static uint8_t arm = 0;
 static uint16_t setpoint_ms = 250;
@@ -82,6 +84,16 @@ static void watch(const state_t *state, const uint32_t step) {
         seen_attitude = state->attitudeQuaternion;
         seen_velocity = state->velocity;
     }
+}
+
+/* Whether the state and the gyro are numbers, and the quaternion is one. */
+static bool usable(const state_t *state, const sensorData_t *sensors) {
+    const quaternion_t q = state->attitudeQuaternion;
+    const float square = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w;
+    return square > 0.9f && square < 1.1f && /* false for NaN */
+           isfinite(state->position.x) && isfinite(state->position.y) && isfinite(state->position.z) &&
+           isfinite(state->velocity.x) && isfinite(state->velocity.y) && isfinite(state->velocity.z) &&
+           isfinite(sensors->gyro.x) && isfinite(sensors->gyro.y) && isfinite(sensors->gyro.z);
 }
 
 static uint8_t decide(const setpoint_t *setpoint, const uint32_t step) {
@@ -131,11 +143,10 @@ static void heading_of(const setpoint_t *setpoint, float heading[2]) {
     }
 }
 
-/* What the policy observes, in the order of @name@.h. Returns false if the quaternion is none. */
-static bool observe(const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state,
+/* What the policy observes, in the order of @name@.h. */
+static void observe(const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state,
                     float obs[@NAME@_OBS_SIZE]) {
     const quaternion_t q = state->attitudeQuaternion; /* body to world; x, y, z, w */
-    const float square = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w;
     float heading[2], axis[3];
     heading_of(setpoint, heading);
 
@@ -159,7 +170,6 @@ static bool observe(const setpoint_t *setpoint, const sensorData_t *sensors, con
     obs[@NAME@_OBS_WY] = sensors->gyro.y * RAD_PER_DEG;
     obs[@NAME@_OBS_WZ] = sensors->gyro.z * RAD_PER_DEG;
 @preview@
-    return square > 0.9f && square < 1.1f; /* false for NaN */
 }
 
 /* An action as a fraction of THRUST_MAX, for normalizedForces. */
@@ -168,13 +178,11 @@ static float fraction(const float action) {
     return share < LEAST_FRACTION ? LEAST_FRACTION : share > 1.0f ? 1.0f : share;
 }
 
-/* One step of the policy. Returns POLICY, or the fault. */
+/* One step of the policy. Returns POLICY, or the fault: the set-point is not finite. */
 static uint8_t run(const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state) {
     const uint64_t begin_us = usecTimestamp();
     float obs[@NAME@_OBS_SIZE], act[@NAME@_ACT_SIZE];
-    if (!observe(setpoint, sensors, state, obs)) {
-        return STOCK_NOT_FINITE;
-    }
+    observe(setpoint, sensors, state, obs);
     status = (uint8_t)@name@_step(&memory, obs, act);
     if (status == 2) {
         return STOCK_NOT_FINITE;
@@ -228,7 +236,9 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
             next_step = step;
             takeovers += 1;
         }
-        if (step == next_step) {
+        if (!usable(state, sensors)) {
+            who = STOCK_NOT_FINITE;
+        } else if (step == next_step) {
             who = run(setpoint, sensors, state);
             next_step = step + PERIOD_STEPS;
         }
@@ -240,7 +250,14 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
         if (who >= STOCK_STATE_OLD) {
             fault = who;
         }
-        fly_stock(control, setpoint, sensors, state, step, before == POLICY || !continued);
+        /* Numbers that are not finite would stay in the filters of the stock controller. */
+        const bool substitute = fault == STOCK_NOT_FINITE && !usable(state, sensors);
+        fly_stock(control, setpoint, substitute ? &last_sensors : sensors, substitute ? &last_state : state, step,
+                  before == POLICY || !continued);
+    }
+    if (usable(state, sensors)) {
+        last_state = *state;
+        last_sensors = *sensors;
     }
     last_step = step;
 }
