@@ -88,6 +88,7 @@ class App:
         self._in, self._out = np.zeros(IN, np.float32), np.zeros(OUT, np.int32)
         self._pointers = self._in.ctypes.data_as(ctypes.c_void_p), self._out.ctypes.data_as(ctypes.c_void_p)
         self.now = 0
+        self.simple_stock = bool(self._library.simple_stock())  # the shim's, whose order is known
         self.passed = bool(self._library.boot())
 
     def arm(self, on: bool = True) -> None:
@@ -107,10 +108,10 @@ class App:
         return found.tolist()
 
 
-def apps(library: Path, number: int) -> list[App]:
-    """As many, armed, each from a copy of the library."""
+def apps(library: Path, number: int, first: int = 0) -> list[App]:
+    """As many, armed, each from a copy of the library, numbered from `first`."""
     found = []
-    for i in range(number):
+    for i in range(first, first + number):
         own = library.with_name(f"{library.stem}_{i}.so")
         own.unlink(missing_ok=True)  # a library that is loaded keeps its file
         shutil.copyfile(library, own)

@@ -61,6 +61,14 @@ void powerDistribution(const control_t *control, motors_thrust_uncapped_t *thrus
 }
 #endif
 
+int simple_stock(void) {
+#ifdef REAL_STOCK
+    return 0;
+#else
+    return 1;
+#endif
+}
+
 float thrust_max_N(void) {
     return THRUST_MAX;
 }

@@ -162,7 +162,9 @@ def platform(policy: Policy) -> Platform | None:
 
 
 def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
-    """The app of a policy without a `refusal`: path in the export folder -> text. `kernel`: NAME.c and NAME.h."""
+    """The app of a policy: path in the export folder -> text; none if there is a `refusal`. `kernel`: NAME.c and NAME.h."""
+    if refusal(policy):
+        return {}
     values = _values(policy, name)
     templates = {path.relative_to(TEMPLATES).as_posix(): path for path in TEMPLATES.rglob("*") if path.is_file()}
     app = {
@@ -172,6 +174,16 @@ def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
         for path, file in templates.items()
     }
     return app | {f"{FOLDER}/src/{file}": kernel[file] for file in (f"{name}.c", f"{name}.h")}
+
+
+def section(policy: Policy) -> str:
+    """What report.md says of it; nothing of a policy that flies no vehicle."""
+    if any(port.spin is None for port in policy.actions):
+        return ""
+    reason = refusal(policy)
+    lines = [f"No app: {reason}."] if reason else [f"`{FOLDER}/` is an app; its README says how to build it.", ""]
+    lines += [] if reason else [f"- {fact}" for fact in facts(policy)]
+    return "\n## Crazyflie\n\n" + "\n".join(lines) + "\n"
 
 
 def _values(policy: Policy, name: str) -> dict[str, str]:
