@@ -74,7 +74,7 @@ def fell(states: Floats) -> Floats:
     return ~(np.linalg.norm(states[..., :3], axis=-1) < FELL_M).all(axis=0)
 
 
-def tail(states: Floats, t: str = "") -> Floats:
+def tail(states: Floats) -> Floats:
     """Mean position [n, 3] of the last second."""
     return states[-TAIL_MS:, :, :3].mean(axis=0)
 
@@ -103,16 +103,11 @@ def following(world: World, library: Path, policy: Policy, kernel: Kernel, n: in
         now = circling(t).velocity_m_s
         return np.concatenate([circling(t + s).velocity_m_s - now for s in ahead_s])
 
-    # The bare kernel knows no heading to turn to: without one, for both.
     start = loop.starts(n, seed=101, distance_m=0.3)
-
-    def follow(t: float) -> Reference:
-        return circling(t)._replace(yaw_deg=0.0)
-
     there = np.array([circling(i * loop.STEP_S).position_m for i in range(round(seconds * 1e3) + 1)])[:, None]
     found = []
     for thrust in (loop.by_app(world, loop.apps(library, n)), loop.by_kernel(world, policy, kernel, n, preview)):
-        states = loop.flown(world, start, seconds, thrust, follow)
+        states = loop.flown(world, start, seconds, thrust, circling)
         error = np.linalg.norm(states[..., :3] - there, axis=-1)[-2 * TAIL_MS :]
         found.append(f"{1e3 * np.sqrt((error**2).mean()):.1f} mm")
     return f"circle of 0.5 m at 0.6 m/s: RMSE {found[0]} from set-points, {found[1]} of the bare kernel with the true preview"

@@ -217,7 +217,10 @@ def by_app(world: World, vehicles: Sequence[App]) -> Callable[[int, Floats, Refe
 def by_kernel(
     world: World, policy: Policy, kernel: Kernel, n: int, preview: Callable[[float], Floats] | None = None
 ) -> Callable[[int, Floats, Reference], Floats]:
-    """Thrusts of the bare kernel, given what it was trained with. `preview(t)` [3k]: of the reference; at rest without."""
+    """Thrusts of the bare kernel, given what it was trained with, in the world turned by the reference's heading.
+
+    `preview(t)` [3k]: of the reference, world; at rest without.
+    """
     every, previews = round(policy.control_period_s / STEP_S), len(policy.observations) - 18
     speeds, c = policy.actions[0].quantity is not None, world.vehicle.thrust_curve
     of_port = [CORNERS.index(corner(port.position_m)) for port in policy.actions]
@@ -227,10 +230,12 @@ def by_kernel(
     def thrust_N(step: int, state: Floats, now: Reference) -> Floats:
         nonlocal thrust, memory
         if step % every == 0:
-            attitude = np.asarray(_matrices(jnp.asarray(state[:, 6:10], jnp.float32))).reshape(n, 9)
-            relative = state[:, 0:3] - now.position_m, state[:, 3:6] - now.velocity_m_s
-            ahead = preview(step * STEP_S) if preview else np.zeros(previews)
-            parts = [attitude, *relative, state[:, 10:13], np.broadcast_to(ahead, (n, previews))]
+            c_yaw, s_yaw = np.cos(np.deg2rad(now.yaw_deg)), np.sin(np.deg2rad(now.yaw_deg))
+            turn = np.array([[c_yaw, s_yaw, 0.0], [-s_yaw, c_yaw, 0.0], [0.0, 0.0, 1.0]])
+            attitude = turn @ np.asarray(_matrices(jnp.asarray(state[:, 6:10], jnp.float32)))
+            relative = [(state[:, 0:3] - now.position_m) @ turn.T, (state[:, 3:6] - now.velocity_m_s) @ turn.T]
+            ahead = (preview(step * STEP_S) if preview else np.zeros(previews)).reshape(-1, 3) @ turn.T
+            parts = [attitude.reshape(n, 9), *relative, state[:, 10:13], np.broadcast_to(ahead.ravel(), (n, previews))]
             obs = np.concatenate(parts, axis=1).astype(np.float32)
             memory, _, action = reference.step(kernel, memory, obs)
             action = action[:, order]
