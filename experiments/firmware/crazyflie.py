@@ -4,18 +4,20 @@
     git -C crazyflie-firmware submodule update --init vendor/FreeRTOS
     .venv/bin/python -m experiments.firmware.crazyflie RUN --firmware crazyflie-firmware
 
-RUN is a folder of a run, or `any`. The app is emitted anew; its headers, stock PID and mixer are the firmware's. It must fly as
-the bare kernel does, hand over to the PID, and each mistake in its source must show.
+RUN is a folder of a run, or `any`. The app is emitted anew; headers, stock PID and mixer are the firmware's. It must fly
+as the bare kernel does, hand over to the PID, and each mistake in its source must show.
 """
 
+import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from experiments.arguments import Parser, run_main
 from experiments.firmware import crazyflie_loop as loop
+from experiments.firmware import crazyflie_mistakes as faulty
 from experiments.firmware import crazyflie_protocol as protocol
 from experiments.firmware.crazyflie_loop import App, Firmware, Floats, Reference, World
 from experiments.output import table
@@ -29,6 +31,7 @@ from qrl.export.quantize import quantize
 from qrl.runs import shipped
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
+from qrl_envs.task import QuadrotorTask
 
 NAME = "policy"
 HEADERS = "src/config src/platform/interface src/drivers/interface src/hal/interface src/modules/interface"
@@ -37,6 +40,7 @@ HEADERS += " src/utils/interface/lighthouse vendor/FreeRTOS/include vendor/FreeR
 SOURCES = "controller/controller_pid controller/attitude_pid_controller controller/position_controller_pid"
 STOCK = [f"src/modules/src/{name}.c" for name in (*SOURCES.split(), "power_distribution_quadrotor")]
 STOCK += [f"src/utils/src/{name}.c" for name in ("pid", "filter", "num")]
+HAND_OVER = "stock given what is not finite"  # of `faulty.of_control`: shown by a flight
 CONFIG = {  # what Kconfig makes of the app's configuration, of what these sources ask for
     "cf2_defconfig": ("CONFIG_PLATFORM_CF2 1",),
     "cf21bl_defconfig": (
@@ -44,6 +48,7 @@ CONFIG = {  # what Kconfig makes of the app's configuration, of what these sourc
         "CONFIG_THRUST_BAT_COMPENSATION_MAX_THRUST 200",
     ),
 }
+WHATS = ("disarmed", "NaN for 5 ms", "state frozen")
 FELL_M, SAME_M, TAIL_MS = 3.0, 0.001, 1000
 
 
@@ -56,7 +61,6 @@ def firmware(tree: Path, build: Platform, out: Path) -> Firmware:
     lines += [build.config.replace("=y", " 1")] if build.config else []
     out.mkdir(parents=True, exist_ok=True)
     (out / "autoconf.h").write_text("".join(f"#define {line}\n" for line in lines), encoding="utf-8")
-    # The macros of the firmware's own build that its headers ask for.
     return Firmware(
         (out, *(tree / path for path in HEADERS.split())), ("-DREAL_STOCK",), tuple(tree / path for path in STOCK)
     )
@@ -77,6 +81,12 @@ def fell(states: Floats) -> Floats:
 def tail(states: Floats) -> Floats:
     """Mean position [n, 3] of the last second."""
     return states[-TAIL_MS:, :, :3].mean(axis=0)
+
+
+def heading_deg(states: Floats) -> Floats:
+    """At the end; [n]."""
+    w, x, y, z = states[-1, :, 6:10].T
+    return np.rad2deg(np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)))
 
 
 def beside_the_kernel(world: World, library: Path, policy: Policy, kernel: Kernel, n: int, seconds: float) -> str:
@@ -110,17 +120,19 @@ def following(world: World, library: Path, policy: Policy, kernel: Kernel, n: in
         states = loop.flown(world, start, seconds, thrust, circling)
         error = np.linalg.norm(states[..., :3] - there, axis=-1)[-2 * TAIL_MS :]
         found.append(f"{1e3 * np.sqrt((error**2).mean()):.1f} mm")
-    return f"circle of 0.5 m at 0.6 m/s: RMSE {found[0]} from set-points, {found[1]} of the bare kernel with the true preview"
+    return f"circle of 0.5 m at 0.6 m/s: RMSE {found[0]} from set-points, {found[1]} of the bare kernel, true preview"
 
 
-def hand_over(world: World, library: Path, n: int) -> Iterator[str]:
+def hand_over(world: World, library: Path, n: int, whats: Sequence[str] = WHATS) -> Iterator[str]:
     """The stock PID of the firmware takes over after 2 s of the policy, and holds the place."""
-    for what in ("disarmed", "NaN for 5 ms", "state frozen"):
+    for what in whats:
         vehicles = loop.apps(library, n)
         ordered = loop.by_app(world, vehicles)
         frozen: dict[str, Floats] = {}
 
-        def thrust_N(step: int, state: Floats, now: Reference, what=what, vehicles=vehicles, ordered=ordered, frozen=frozen):
+        def thrust_N(
+            step: int, state: Floats, now: Reference, what=what, vehicles=vehicles, ordered=ordered, frozen=frozen
+        ):
             if what == "disarmed" and step == 2000:
                 for app in vehicles:
                     app.arm(False)
@@ -133,15 +145,16 @@ def hand_over(world: World, library: Path, n: int) -> Iterator[str]:
         states = loop.flown(world, loop.starts(n, seed=102, distance_m=0.3, tilt_rad=0.5), 6.0, thrust_N)
         furthest = np.linalg.norm(states[2000:, :, :3], axis=-1).max()
         last = np.linalg.norm(tail(states), axis=1).max()
-        yield f"{what} at 2 s: the firmware's PID flies on, at most {furthest:.2f} m away, {last:.2f} m in the last second"
+        verdict = "flies on" if furthest < FELL_M else "FALLS"
+        yield f"{what} at 2 s: the firmware's PID {verdict}: at most {furthest:.2f} m away, at last {last:.2f} m"
 
 
 def mistakes(
     world: World, library: Path, app: Path, made: Firmware, policy: Policy, kernel: Kernel, n: int, seconds: float
 ) -> Iterator[tuple[str, str, str]]:
     """For each mistake: its name, what the comparison with the integer reference says, and what n flights do."""
-    of_orders = protocol.of_orders(NAME.upper(), policy)
-    both = of_orders | protocol.of_control(NAME.upper())
+    of_orders = faulty.of_orders(NAME.upper(), policy)
+    both = of_orders | faulty.of_control(NAME.upper())
     built = {
         name: loop.build(app, made, library.with_name(f"mistake{i}.so"), *mutants)
         for i, (name, mutants) in enumerate(both.items())
@@ -152,15 +165,18 @@ def mistakes(
     every = np.tile(start, (len(vehicles) // n, 1))
     flights = loop.flown(world, every, seconds, loop.by_app(world, vehicles), circling)
     right, *wrong = np.split(flights, len(vehicles) // n, axis=1)
-    said = {}
+    said = {HAND_OVER: next(hand_over(world, built[HAND_OVER], n, WHATS[1:2]))}
     for name, states in zip(of_orders, wrong, strict=True):
         apart = np.linalg.norm(tail(states) - tail(right), axis=1).max()
-        said[name] = f"{fell(states).sum()} of {n} fall" if fell(states).any() else f"{1e3 * apart:.1f} mm apart"
+        turned = np.abs((heading_deg(states) - heading_deg(right) + 180.0) % 360.0 - 180.0).max()
+        said[name] = (
+            f"{fell(states).sum()} of {n} fall" if fell(states).any() else f"{1e3 * apart:.1f} mm, {turned:.1f}° apart"
+        )
     for name, path in built.items():
         yield name, next(protocol.faults(boots(path), policy, kernel), "–"), said.get(name, "–")
 
 
-def boots(library: Path):  # noqa: ANN201
+def boots(library: Path) -> Callable[[], App]:
     """A function that boots one more vehicle's firmware."""
     count = iter(range(1000))
 
@@ -188,14 +204,15 @@ def main(argv: list[str] | None = None) -> int:
         parser.error(str(error))
 
 
-def fly(args) -> int:  # noqa: ANN001
+def fly(args: argparse.Namespace) -> int:
     run = TrainedRun.load(shipped.run_folder(args.run))
     policy = run.policy()
     if reason := crazyflie.refusal(policy):
         raise BadInput(f"{args.run}: no app for a Crazyflie: {reason}")
     kernel = quantize(policy)
-    own = run.task.vehicle
-    vehicle = own if not crazyflie.any_vehicle(policy) else tasks.load("hover", args.vehicle or "cf21_brushless").vehicle
+    task = tasks.load("hover", args.vehicle or "cf21_brushless") if crazyflie.any_vehicle(policy) else run.task
+    assert isinstance(task, QuadrotorTask)
+    vehicle = task.vehicle
     build = crazyflie.platform(policy) or min(PLATFORMS, key=lambda p: abs(p.thrust_max_N - vehicle.motors[0].max_N))
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)

@@ -1,6 +1,7 @@
 """The emitted app for a Crazyflie in the loop: compiled for a PC, at 1 kHz in the plant, in the firmware's units."""
 
 import ctypes
+import re
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
@@ -22,6 +23,7 @@ from qrl_envs.vehicle import Vehicle
 
 SHIM = Path(__file__).parent / "crazyflie_shim.c"
 STEP_S = 0.001  # of the stabilizer
+PARTS = (3, 6, 10, 13)  # of a flight: position, velocity, quaternion w x y z, body rates [rad/s], rotor speeds
 STRICT = ("-Wall", "-Wextra", "-Werror")
 IN, OUT = 32, 6
 POLICY = 1  # `qrl.state`
@@ -48,15 +50,17 @@ class Mutant(NamedTuple):
 def build(app: Path, firmware: Firmware, out: Path, *mutants: Mutant) -> Path:
     """The library `out` of the app in the folder `crazyflie/` of an export; ValueError if a mutant's text is not in it.
 
-    Without mutants, a warning fails, and the kernel and the firmware's sources are compiled; with them, those of the same
-    folder as `out` are linked.
+    Without mutants, a warning fails, and the kernel and the firmware's sources are compiled; with them, those of the
+    same folder as `out` are linked.
     """
     source = next(app.glob("src/*_controller.c"))
     text = source.read_text(encoding="utf-8")
     for mutant in mutants:
         if mutant.old not in text:
             raise ValueError(f"not in {source}: {mutant.old}")
-        text = text.replace(mutant.old, mutant.new)
+    # Together: one's new text may hold another's old.
+    olds = {mutant.old: mutant.new for mutant in mutants}
+    text = re.sub("|".join(map(re.escape, olds)) or "$^", lambda match: olds[match[0]], text)
     out.parent.mkdir(parents=True, exist_ok=True)
     mutated, kernel, stock = out.with_suffix(".c"), out.with_name("kernel.o"), out.with_name("stock.o")
     mutated.write_text(text, encoding="utf-8")
@@ -64,7 +68,15 @@ def build(app: Path, firmware: Firmware, out: Path, *mutants: Mutant) -> Path:
     common = ("gcc", "-std=gnu11", "-fPIC", *firmware.flags, *includes)
     if not mutants:
         _run(*common, "-O2", *STRICT, "-c", str(source), "-o", str(out.with_name("app.o")))
-        _run(*common, "-O2", *STRICT, "-c", str(source.with_name(source.name.replace("_controller", ""))), "-o", str(kernel))
+        _run(
+            *common,
+            "-O2",
+            *STRICT,
+            "-c",
+            str(source.with_name(source.name.replace("_controller", ""))),
+            "-o",
+            str(kernel),
+        )
         if firmware.sources:  # theirs, whose warnings are not ours
             _run(*common, "-O1", "-w", "-r", "-nostdlib", *map(str, firmware.sources), "-o", str(stock))
     objects = [str(kernel), *([str(stock)] if firmware.sources else [])]
@@ -95,7 +107,7 @@ class App:
         self._library.set_arm(int(on))
 
     def tick(self, numbers: Floats, steps: int = 1) -> NDArray[np.int32]:
-        """The next step, of [IN] numbers as `tick` of the shim takes them; [OUT]. `steps`: how far its count goes on."""
+        """The next step, of numbers [IN] as the shim's `tick` takes them; [OUT]. `steps`: how far its count goes on."""
         self._in[:] = numbers
         self.now += steps
         self._library.tick(ctypes.c_uint32(self.now), *self._pointers)
@@ -130,7 +142,8 @@ class Reference(NamedTuple):
     yaw_deg: float = 0.0
 
 
-REST = Reference(*np.zeros((4, 3)))
+REST = Reference(np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+Ordered = Callable[[int, Floats, Reference], Floats]  # step, states [n, 13], reference -> thrusts [n, motors]
 
 
 def numbers(state: Floats, reference: Reference) -> NDArray[np.float32]:
@@ -161,48 +174,51 @@ class World:
             plant.ranges(Uncertainty(), vehicle), physics, jnp.full(plant.DRAWS + len(vehicle.motors), 0.5)
         )
 
-        def step(body: Body, speed: jax.Array, set_point: jax.Array) -> tuple[Body, jax.Array]:
+        def step(flight: jax.Array, thrust_N: jax.Array) -> jax.Array:
+            position, velocity, attitude, rate, speed = jnp.split(flight, PARTS)
             late_s = jnp.float32(0.0)
-            return plant.advance(world, world.disturbance, body, speed, (set_point, set_point), late_s, STEP_S)
+            set_point = rotors.speed_of(world.rotors.curve, thrust_N / physics.motor_max_N)
+            body, speed = plant.advance(
+                world,
+                world.disturbance,
+                Body(Pose(position, attitude), Twist(velocity, rate)),
+                speed,
+                (set_point, set_point),
+                late_s,
+                STEP_S,
+            )
+            return jnp.concatenate(
+                [body.pose.position_m, body.twist.velocity_m_s, body.pose.attitude, body.twist.body_rate_rad_s, speed]
+            )
 
         self._step = jax.jit(jax.vmap(step))
-        self._speed_of = jax.jit(lambda thrust_N: rotors.speed_of(world.rotors.curve, thrust_N / physics.motor_max_N))
         self.max_N = np.array([motor.max_N for motor in vehicle.motors])
         # Of each motor, which of M1 to M4 it is.
         self.crazyflie = [CORNERS.index(corner(motor.position_m)) for motor in vehicle.motors]
 
-    def begin(self, state: Floats) -> tuple[Body, jax.Array]:
-        """Body and rotor speeds, in hover, of states [n, 13]."""
-        parts = [jnp.asarray(state[:, at], jnp.float32) for at in (slice(0, 3), slice(6, 10), slice(3, 6), slice(10, 13))]
-        body = Body(Pose(parts[0], parts[1]), Twist(parts[2], parts[3]))
-        speed = self._speed_of(jnp.asarray(self.vehicle.hover_thrusts_N, jnp.float32))
-        return body, jnp.broadcast_to(speed, (len(state), len(speed)))
+    def begin(self, state: Floats) -> NDArray[np.float32]:
+        """Flights [n, 17]: of states [n, 13], and the rotor speeds of hover."""
+        return np.concatenate([state, np.tile(self.vehicle.hover_speeds, (len(state), 1))], axis=1).astype(np.float32)
 
-    def step(self, body: Body, speed: jax.Array, thrust_N: Floats) -> tuple[Body, jax.Array]:
+    def step(self, flights: NDArray[np.float32], thrust_N: Floats) -> NDArray[np.float32]:
         """1 ms under thrusts [n, motors]."""
-        return self._step(body, speed, self._speed_of(jnp.asarray(np.minimum(thrust_N, self.max_N), jnp.float32)))
-
-
-def numbers_of(body: Body) -> Floats:
-    """State [n, 13] of bodies."""
-    parts = body.pose.position_m, body.twist.velocity_m_s, body.pose.attitude, body.twist.body_rate_rad_s
-    return np.concatenate([np.asarray(part, np.float64) for part in parts], axis=1)
+        return np.asarray(self._step(flights, np.minimum(thrust_N, self.max_N).astype(np.float32)))
 
 
 def flown(
-    world: World, start: Floats, seconds: float, thrust_N: Callable[[int, Floats, Reference], Floats], follow=None
+    world: World, start: Floats, seconds: float, thrust_N: Ordered, follow: Callable[[float], Reference] | None = None
 ) -> Floats:
-    """States [ms, n, 13] from `start` [n, 13] under thrusts [n, motors] of step, state and `follow(t)`, at rest without."""
-    body, speed = world.begin(start)
-    found = [numbers_of(body)]
+    """States [ms, n, 13] from `start` [n, 13]; `follow(t)`: the reference, at rest without."""
+    flights = world.begin(start)
+    found = [start]
     for step in range(round(seconds / STEP_S)):
         ordered = thrust_N(step, found[-1], follow(step * STEP_S) if follow else REST)
-        body, speed = world.step(body, speed, ordered)
-        found.append(numbers_of(body))
+        flights = world.step(flights, ordered)
+        found.append(flights[:, :13].astype(np.float64))
     return np.stack(found)
 
 
-def by_app(world: World, vehicles: Sequence[App]) -> Callable[[int, Floats, Reference], Floats]:
+def by_app(world: World, vehicles: Sequence[App]) -> Ordered:
     """Thrusts as the firmware of each vehicle orders them, cut and rounded as its motors' driver does."""
     most, least = vehicles[0].thrust_max_N, vehicles[0].thrust_min_N
 
@@ -216,7 +232,7 @@ def by_app(world: World, vehicles: Sequence[App]) -> Callable[[int, Floats, Refe
 
 def by_kernel(
     world: World, policy: Policy, kernel: Kernel, n: int, preview: Callable[[float], Floats] | None = None
-) -> Callable[[int, Floats, Reference], Floats]:
+) -> Ordered:
     """Thrusts of the bare kernel, given what it was trained with, in the world turned by the reference's heading.
 
     `preview(t)` [3k]: of the reference, world; at rest without.

@@ -1,7 +1,4 @@
-"""What the app for a Crazyflie orders and who flies, step by step, against the integer reference; and mistakes to find.
-
-`faults` says what an app does wrong; `MISTAKES` are changes of its source, each of which it must find.
-"""
+"""What the app for a Crazyflie orders and who flies, step by step, against the integer reference."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -9,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.firmware.crazyflie_loop import CORNERS, App, Floats, Mutant, Reference, corner, numbers, starts
+from experiments.firmware.crazyflie_loop import CORNERS, App, Floats, Reference, corner, numbers, starts
 from qrl.export import kernel as reference
 from qrl.export.kernel import Kernel
 from qrl.export.policy import Policy
@@ -20,9 +17,7 @@ CURVES = {0.12: -0.1041, 0.2: -0.0339}  # c of the rotors' thrust by THRUST_MAX 
 LEAST_N = {0.12: 0.01281758, 0.2: 0.02136263}  # THRUST_MIN
 TOLERANCE = 0.004  # of a force: a step or two of the integer network's inputs, which float rounding may move
 KIND, AGE = 30, 31  # places in `App.tick`'s numbers
-MOVING = Reference(
-    *np.array([[0.3, -0.2, 0.5], [0.4, 0.2, -0.1], [0.8, -0.6, 0.4], [1.0, 2.0, -1.5]]), yaw_deg=35.0
-)
+MOVING = Reference(*np.array([[0.3, -0.2, 0.5], [0.4, 0.2, -0.1], [0.8, -0.6, 0.4], [1.0, 2.0, -1.5]]), yaw_deg=35.0)
 
 
 class Expected(NamedTuple):
@@ -39,7 +34,11 @@ class Expected(NamedTuple):
         axis, w = state[7:10], state[6]
         cross = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
         attitude = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
-        parts = [(turn @ attitude).ravel(), turn @ (state[0:3] - now.position_m), turn @ (state[3:6] - now.velocity_m_s)]
+        parts = [
+            (turn @ attitude).ravel(),
+            turn @ (state[0:3] - now.position_m),
+            turn @ (state[3:6] - now.velocity_m_s),
+        ]
         parts.append(state[10:13])
         for port in self.policy.observations[18::3]:
             t = port.ahead_s or 0.0
@@ -180,8 +179,8 @@ def old_state(app: App, policy: Policy, kernel: Kernel) -> Iterator[str]:
 
 
 def not_finite(app: App, policy: Policy, kernel: Kernel) -> Iterator[str]:
-    """Each number of the state and the gyro that is not finite, and a quaternion that is none: at once, until armed anew,
-    and kept from the stock controller. Of the set-point, when the policy runs.
+    """Each number of the state and the gyro that is not finite, and a quaternion that is none: at once, until armed
+    anew, and kept from the stock controller. Of the set-point, when the policy runs.
     """
     rows = iter(numbers(states(200, 10), MOVING))
     bad = [(i, value) for i in range(14) for value in (np.nan, np.inf)] + [(slice(6, 10), 0.0), (slice(6, 10), 3.0)]
@@ -197,86 +196,3 @@ def not_finite(app: App, policy: Policy, kernel: Kernel) -> Iterator[str]:
 
 
 CASES = (orders, takes_over, stock, set_points, full_state, old_state, not_finite)
-
-
-def motors(*places: int) -> tuple[Mutant, ...]:
-    """M1 to M4 ordered as if they were these."""
-    return tuple(Mutant(f"held[{i}] = ", f"held[{place}] = ") for i, place in enumerate(places))
-
-
-GYRO = tuple(Mutant(f"gyro.{axis} * RAD_PER_DEG", f"gyro.{axis}") for axis in "xyz")
-Q = "const quaternion_t q = state->attitudeQuaternion;"
-TO_BODY = """for (int i = 0; i < 3; ++i) {{
-        axis[i] = 0.0f;
-        for (int j = 0; j < 3; ++j) axis[i] += axes[i][j] * obs[at + j];
-    }} for (int i = 0; i < 3; ++i) obs[at + i] = axis[i];"""
-
-
-def in_body_frame(what: str, NAME: str) -> tuple[Mutant, ...]:
-    """Position or velocity turned into the body frame."""
-    before = f"    obs[{NAME}_OBS_WX] ="
-    turn = f"    {{ const int at = {NAME}_OBS_{what}; {TO_BODY.format()} }}\n"
-    return (Mutant(before, turn + before),)
-
-
-def mistakes(NAME: str, policy: Policy) -> dict[str, tuple[Mutant, ...]]:
-    """Changes of the source of an app, by what is wrong then: of orders, and of who flies."""
-    return of_orders(NAME, policy) | of_control(NAME)
-
-
-def of_orders(NAME: str, policy: Policy) -> dict[str, tuple[Mutant, ...]]:
-    """Units, orders and signs: a flight is to go wrong too."""
-    swaps = {(i, j): [j if k == i else i if k == j else k for k in range(4)] for i in range(4) for j in range(i)}
-    found = {
-        "gyro in deg/s": GYRO,
-        **{f"gyro.{axis} the other way": (Mutant(f"gyro.{axis} *", f"gyro.{axis} * -"),) for axis in "xyz"},
-        "quaternion w x y z": (Mutant(Q, Q.replace(" q ", " p ") + " const quaternion_t q = {.x = p.y, .y = p.z, .z = p.w, .w = p.x};"),),
-        "quaternion conjugated": (Mutant(Q, Q.replace("const ", "") + " q.w = -q.w;"),),
-        "matrix by columns": (Mutant("R11 + 3 * row + column", "R11 + 3 * column + row"),),
-        **{f"M{j + 1} and M{i + 1} swapped": motors(*order) for (i, j), order in swaps.items()},
-        "motors mirrored: spins reversed": motors(3, 2, 1, 0),
-        "motors turned by one": motors(1, 2, 3, 0),
-        "position the other way": (Mutant("state->position.x - setpoint->position.x", "setpoint->position.x - state->position.x"),),
-        "position absolute": tuple(Mutant(f"state->position.{a} - setpoint->position.{a}", f"state->position.{a}") for a in "xyz"),
-        "velocity absolute": tuple(Mutant(f"state->velocity.{a} - setpoint->velocity.{a}", f"state->velocity.{a}") for a in "xyz"),
-        "velocity in the body frame": in_body_frame("VX", NAME),
-        "position in the body frame": in_body_frame("PX", NAME),
-        "heading ignored": (Mutant("cosf(setpoint->attitude.yaw * RAD_PER_DEG)", "1.0f"), Mutant("sinf(setpoint->attitude.yaw * RAD_PER_DEG)", "0.0f")),
-        "heading the other way": (Mutant("sinf(setpoint->attitude.yaw", "sinf(-setpoint->attitude.yaw"),),
-        "heading in rad": (Mutant("attitude.yaw * RAD_PER_DEG", "attitude.yaw"),),
-        "forces of another unit": (Mutant("share > 1.0f", "1.5f * share > 1.0f"), Mutant(": share;", ": 1.5f * share;")),
-        "each millisecond": (Mutant("step + PERIOD_STEPS", "step + 1"),),
-        "half as often": (Mutant("step + PERIOD_STEPS", "step + 2 * PERIOD_STEPS"),),
-        "motors may stop": (Mutant("share < LEAST_FRACTION ? LEAST_FRACTION", "share < 0.0f ? 0.0f"),),
-        "forces as torques": (Mutant("controlModeForce;", "controlModeForceTorque;"),),
-    }  # fmt: skip
-    if len(policy.observations) > 18:
-        found |= {
-            "no acceleration ahead": (Mutant("setpoint->acceleration.x * t", "0.0f * t"),),
-            "no jerk ahead": (Mutant("half = 0.5f * t * t", "half = 0.0f"),),
-            "acceleration not turned": (Mutant("turned(heading, setpoint->acc", "turned((const float[]){1.0f, 0.0f}, setpoint->acc"),),
-        }  # fmt: skip
-    if policy.actions[0].quantity:
-        found["speed as force"] = (Mutant("action * (c + (1.0f - c) * action)", "action"),)
-    else:
-        found["THRUST_MAX of another platform"] = (Mutant("action / THRUST_MAX;", "action / (0.6f * THRUST_MAX);"),)
-    return found
-
-
-def of_control(NAME: str) -> dict[str, tuple[Mutant, ...]]:
-    """Who flies, and from what memory."""
-    return {
-        "no reset": (Mutant(f"{NAME.lower()}_reset(&memory);", ""),),
-        "no reset after a gap": (Mutant("before != POLICY || !continued", "before != POLICY"),),
-        "not at once": (Mutant("next_step = step;", "next_step = step + 3;"),),
-        "flies unarmed": (Mutant("if (!arm)", "if (0)"),),
-        "any set-point": (Mutant("return STOCK_SETPOINT;", ";"),),
-        "set-point of any age": (Mutant("return STOCK_SETPOINT_OLD;", ";"),),
-        "state of any age": (Mutant("> state_ms", "> 100000u"),),
-        "any number": (Mutant("if (!usable(state, sensors)) {\n            who", "if (0) {\n            who"), Mutant("if (status == 2)", "if (0)")),
-        "status 2 ignored": (Mutant("if (status == 2)", "if (0)"),),
-        "any quaternion": (Mutant("square > 0.9f && square < 1.1f", "true"),),
-        "stock given what is not finite": (Mutant("= fault == STOCK_NOT_FINITE &&", "= false &&"),),
-        "faults forgotten": (Mutant("if (fault != STOCK_UNARMED)", "if (0)"),),
-        "stock output mixed": (Mutant("controllerPid(&stock, setpoint, sensors, state, takes_over ? 0 : step);\n    *control = stock;", "controllerPid(control, setpoint, sensors, state, step);"),),
-    }  # fmt: skip

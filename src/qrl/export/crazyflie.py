@@ -1,4 +1,4 @@
-"""The app for a Crazyflie: an out-of-tree controller of crazyflie-firmware around an emitted kernel (docs/crazyflie.md).
+"""The app for a Crazyflie: an out-of-tree controller of crazyflie-firmware around a kernel (docs/crazyflie.md).
 
 Facts of the firmware are those of its release 2026.08: `src/platform/interface/platform_defaults_*.h`,
 `src/modules/src/power_distribution_quadrotor.c`.
@@ -17,7 +17,10 @@ RELEASE = "2026.08"
 # Its motors M1 to M4: the signs of body x and y, and of the reaction torque about body z; NAMES says them.
 MOTORS = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
 NAMES = ("front right", "back right", "back left", "front left")
-MEASURED = "r11 r12 r13 r21 r22 r23 r31 r32 r33 px py pz vx vy vz wx wy wz".split()
+MEASURED = [
+    *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+    *(f"{quantity}{axis}" for quantity in "pvw" for axis in "xyz"),
+]
 MOST_ARM_RATIO = 1.3  # of a motor's distance from the center, by which a vehicle may differ from the platform
 MOST_HOVER = 0.8  # of a motor's greatest thrust
 MAIN_LOOP_US = 1000
@@ -81,14 +84,14 @@ def refusal(policy: Policy) -> str | None:
     names = [port.name for port in policy.observations]
     previews = [(axis, k) for k, axis in enumerate(port.name[-1] for port in policy.observations[18:])]
     if names[:18] != MEASURED or any(port.ahead_s is None for port in policy.observations[18:]) or len(previews) % 3:
-        return "its observation is not a vehicle's state, and previews of a reference"
+        return "the observation is not a vehicle's state, and previews of a reference"
     if len(policy.actions) != 4:
-        return f"it has four motors, and the policy {len(policy.actions)}"
+        return f"a Crazyflie has four motors, and the policy {len(policy.actions)}"
     if not (any_vehicle(policy) or all(port.unit == "N" for port in policy.actions)):
-        return "its motors are ordered neither thrusts [N] nor fractions of their greatest speed"
+        return "the motors are ordered neither thrusts [N] nor fractions of their greatest speed"
     period_us = round(policy.control_period_s * 1e6)
     if period_us % MAIN_LOOP_US or period_us < MAIN_LOOP_US:
-        return f"a control period of {policy.control_period_s * 1e3:g} ms is no whole number of its main loop's 1 ms"
+        return f"a control period of {policy.control_period_s * 1e3:g} ms is no whole number of the main loop's 1 ms"
     order = motor_order(policy)
     if isinstance(order, str):
         return order
@@ -100,7 +103,9 @@ def refusal(policy: Policy) -> str | None:
         return f"hover takes {hover_N:.3g} N of a motor, and a Crazyflie's have at most {most_N:g} N"
     if not _fitting(policy):
         least, greatest = (f"{pick(p.arm_m for p in PLATFORMS) * 1e3:.0f}" for pick in (min, max))
-        return f"its motors are {arm_m(policy) * 1e3:.0f} mm from the center, and a Crazyflie's {least} to {greatest} mm"
+        return (
+            f"the motors are {arm_m(policy) * 1e3:.0f} mm from the center, and a Crazyflie's {least} to {greatest} mm"
+        )
     return None
 
 
@@ -111,10 +116,10 @@ def motor_order(policy: Policy) -> list[int] | str:
     for number, (x, y, spin) in enumerate(MOTORS, 1):
         there = [i for i, place in enumerate(found) if place and place[:2] == (x, y)]
         if len(there) != 1:
-            return f"it has one motor {NAMES[number - 1]} (M{number}), and the vehicle {len(there)}"
+            return f"a Crazyflie has one motor {NAMES[number - 1]} (M{number}), and the vehicle {len(there)}"
         if found[there[0]] != (x, y, spin):
             return (
-                f"its motor {NAMES[number - 1]} (M{number}) has spin {spin:+d}, and the vehicle's"
+                f"a Crazyflie's motor {NAMES[number - 1]} (M{number}) has spin {spin:+d}, and the vehicle's"
                 f" ({policy.actions[there[0]].name}) {-spin:+d}"
             )
         order.append(there[0])
@@ -162,7 +167,7 @@ def platform(policy: Policy) -> Platform | None:
 
 
 def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
-    """The app of a policy: path in the export folder -> text; none if there is a `refusal`. `kernel`: NAME.c and NAME.h."""
+    """The app of a policy: path in the export folder -> text; none with a `refusal`. `kernel`: NAME.c and NAME.h."""
     if refusal(policy):
         return {}
     values = _values(policy, name)
@@ -218,7 +223,7 @@ def _preview(policy: Policy, name: str) -> str:
 
 
 PREVIEW = """
-    /* Commanders do not tell what comes: the reference is taken to go on with the acceleration and jerk of the set-point. */
+    /* A set-point does not tell what comes: the reference is taken to go on with its acceleration and jerk. */
     static const float ahead_s[] = {{{times}}};
     for (int k = 0; k < {count}; ++k) {{
         const float t = ahead_s[k], half = 0.5f * t * t;
@@ -272,7 +277,9 @@ def facts(policy: Policy) -> list[str]:
             f" {build.arm_m * 1e3:.0f} mm, {build.thrust_max_N:g} N. Weigh yours."
         )
         if limit_N > 1.01 * build.thrust_max_N:
-            found.append(f"Its orders above {build.thrust_max_N:g} N are cut: it has less thrust than it was trained with.")
+            found.append(
+                f"Its orders above {build.thrust_max_N:g} N are cut: it has less thrust than it was trained with."
+            )
         if policy.memory is None or not (policy.memory.integral or policy.memory.units):
             found.append("It has no integral and no memory to learn from: a mass that differs by 1 % leaves an offset.")
     about = policy.observations[9].frame
@@ -280,14 +287,16 @@ def facts(policy: Policy) -> list[str]:
     if len(policy.observations) > 18:
         most_s = max(port.ahead_s or 0.0 for port in policy.observations)
         found.append(
-            f"It looks up to {most_s:g} s ahead. Set-points say nothing of that: the reference is taken to go on with the"
-            " acceleration and jerk of the set-point, exact for a set-point at rest."
+            f"It looks up to {most_s:g} s ahead, of which set-points say nothing: the reference is taken to go on with"
+            " the acceleration and jerk of the set-point. That is exact at rest."
         )
     return found
 
 
 def _build(build: Platform | None) -> str:
     if build is None:
-        return "`cf2_defconfig` for a Crazyflie 2.1+ or 2.X, `cf21bl_defconfig` for a 2.1 Brushless; with the thrust" \
+        return (
+            "`cf2_defconfig` for a Crazyflie 2.1+ or 2.X, `cf21bl_defconfig` for a 2.1 Brushless; with the thrust"
             " upgrade kit add `CONFIG_CRAZYFLIE_THRUST_UPGRADE_KIT=y` to `app-config`."
+        )
     return f"`{build.defconfig}`: {build.title}. `src/` refuses another platform."
