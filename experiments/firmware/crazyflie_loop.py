@@ -192,6 +192,7 @@ class World:
             )
 
         self._step = jax.jit(jax.vmap(step))
+        self.min_N = np.array([motor.min_N for motor in vehicle.motors])
         self.max_N = np.array([motor.max_N for motor in vehicle.motors])
         # Of each motor, which of M1 to M4 it is.
         self.crazyflie = [CORNERS.index(corner(motor.position_m)) for motor in vehicle.motors]
@@ -256,6 +257,7 @@ def by_kernel(
             memory, _, action = reference.step(kernel, memory, obs)
             action = action[:, order]
             thrust = world.max_N * action * (c + (1 - c) * action) if speeds else action
+            thrust = np.maximum(thrust, world.min_N)  # as the plant of training does
         return thrust
 
     return thrust_N

@@ -257,10 +257,12 @@ def test_each_mistake_with_speeds_is_found(tmp_path: Path) -> None:
 
 
 def test_a_self_test_that_fails_grounds_it(built: Built) -> None:
-    app = App(built.with_mistake(Mutant(f"{NAME}_selftest() == 0", f"{NAME}_selftest() == 1")))
-    assert not app.passed
-    app.arm()
-    assert app.tick(loop.numbers(protocol.states(1, 0), protocol.MOVING)[0])[4:].tolist() == [6, 0]
+    failing = Mutant(f"{NAME}_selftest() == 0", f"{NAME}_selftest() == 1")
+    for library, passes, state in ((built.library, True, [1, 1]), (built.with_mistake(failing), False, [6, 0])):
+        app = App(library)
+        assert app.passed == passes
+        app.arm()
+        assert app.tick(loop.numbers(protocol.states(1, 0), protocol.MOVING)[0])[4:].tolist() == state
 
 
 GROUNDED = "gyro in deg/s, gyro.x the other way, quaternion w x y z, quaternion conjugated, matrix by columns"
