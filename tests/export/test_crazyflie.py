@@ -208,7 +208,11 @@ def test_the_files_are_whole() -> None:
     readme = crazyflie.files(of_vehicle("crazyflie"), kernel, NAME)["crazyflie/README.md"]
     assert "30.0 g" in readme
     assert "above 0.12 N are cut" in readme
-    assert "leaves an offset" in readme
+    assert "flies at an offset" in readme
+    assert "hover: reach a point and hover there." in readme
+    assert (
+        "CONFIG_CRAZYFLIE_21_PLUS=y\n" in crazyflie.files(of_vehicle("crazyflie"), kernel, NAME)["crazyflie/app-config"]
+    )
 
 
 def test_another_platform_does_not_compile(built: Built) -> None:

@@ -51,6 +51,8 @@ def export(args: argparse.Namespace) -> int:
         memory = f"{cost.flash:>6,} B {max(cost.stack):>5} B {cost.state:>4} B"
         console.print(f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {memory}")
     duration = clock(time.perf_counter() - start_time)
+    if (run.folder / "export" / crazyflie.FOLDER).is_dir():
+        console.print(f"Crazyflie: {run.folder / 'export' / crazyflie.FOLDER} is an app for its firmware")
     console.print(f"done in {duration}: {run.folder / 'export'}/{name}.c, .h, report.md")
     return DONE
 

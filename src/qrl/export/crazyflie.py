@@ -204,7 +204,7 @@ def _values(policy: Policy, name: str) -> dict[str, str]:
         "preview": _preview(policy, name),
         "fraction": _fraction(policy),
         "platform_guard": _guard(policy, build),
-        "platform_config": build.config if build else "",
+        "platform_config": f"\n{build.config}" if build and build.config else "",
         "defconfig": build.defconfig if build else "cf2_defconfig",
         "image": "build/" + (build.defconfig if build else "cf2_defconfig").replace("_defconfig", ".bin"),
         "facts": "\n".join(f"- {line}" for line in facts(policy)),
@@ -223,6 +223,7 @@ def _preview(policy: Policy, name: str) -> str:
 
 
 PREVIEW = """
+
     /* A set-point does not tell what comes: the reference is taken to go on with its acceleration and jerk. */
     static const float ahead_s[] = {{{times}}};
     for (int k = 0; k < {count}; ++k) {{
@@ -265,7 +266,12 @@ def _guard(policy: Policy, build: Platform | None) -> str:
 
 def facts(policy: Policy) -> list[str]:
     """What its pilot must know of the policy, a sentence each."""
-    found = [f"The policy runs every {policy.control_period_s * 1e3:.0f} ms; the motors hold between."]
+    run, about = policy.provenance, policy.observations[9].frame
+    found = [
+        f"{' '.join(run.task.split())}: {' '.join(run.description.split())}.",
+        f"The set-point's position is {about.removeprefix('world: position from ')}.",
+        f"The policy runs every {policy.control_period_s * 1e3:.0f} ms; the motors hold between.",
+    ]
     build = platform(policy)
     if build is None:
         found.append("It orders rotor speeds and was trained on many vehicles: it flies each Crazyflie.")
@@ -281,9 +287,7 @@ def facts(policy: Policy) -> list[str]:
                 f"Its orders above {build.thrust_max_N:g} N are cut: it has less thrust than it was trained with."
             )
         if policy.memory is None or not (policy.memory.integral or policy.memory.units):
-            found.append("It has no integral and no memory to learn from: a mass that differs by 1 % leaves an offset.")
-    about = policy.observations[9].frame
-    found.append(f"Position is that of {about.removeprefix('world: position from ')}: the set-point's position.")
+            found.append("It has no integral and no recurrent memory: a vehicle of another mass flies at an offset.")
     if len(policy.observations) > 18:
         most_s = max(port.ahead_s or 0.0 for port in policy.observations)
         found.append(

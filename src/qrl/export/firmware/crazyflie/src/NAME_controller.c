@@ -1,8 +1,8 @@
 /*
  * @name@.c as a controller of crazyflie-firmware: an out-of-tree app. What to set and to watch: README.md.
  *
- * The stabilizer calls controllerOutOfTree at 1 kHz. The policy runs every @period_ms@ ms, its motors hold between. It flies
- * while qrl.arm is 1 and the set-point is an absolute position with a heading; in all other cases the stock PID does.
+ * The stabilizer calls controllerOutOfTree at 1 kHz. The policy runs every @period_ms@ ms, the motors hold between. It
+ * flies while qrl.arm is 1 and the set-point is an absolute position with a heading; in all other cases the stock PID does.
  *
  * The code in this folder may be used without restriction, in any product and under any license.
  */
@@ -37,7 +37,7 @@ _Static_assert(STABILIZER_NR_OF_MOTORS == 4 && @NAME@_ACT_SIZE == 4, "four motor
 
 #define RAD_PER_DEG 0.017453293f
 
-/* Below THRUST_MIN the firmware stops a motor, and it truncates a fraction to 1/65535: the least that keeps it running. */
+/* The least that keeps a motor running: below THRUST_MIN the firmware stops it, and it truncates to 1/65535. */
 #define LEAST_FRACTION (THRUST_MIN / THRUST_MAX + 1.5f / 65535.0f)
 
 /* The log variable qrl.state: who flies, and if it is the stock controller, why. */
@@ -47,14 +47,14 @@ enum {
     STOCK_SETPOINT = 2,     /* it is no absolute position with a heading: as ordered, or by the supervisor */
     STOCK_SETPOINT_OLD = 3, /* none for qrl.setpointMs */
     /* Faults: until qrl.arm is set to 0. */
-    STOCK_STATE_OLD = 4,   /* the estimate has not changed for qrl.stateMs */
-    STOCK_NOT_FINITE = 5,  /* the state, the gyro or the set-point; or the quaternion is none */
-    STOCK_SELFTEST = 6,    /* this build does not compute the policy that was verified */
+    STOCK_STATE_OLD = 4,  /* the estimate has not changed for qrl.stateMs */
+    STOCK_NOT_FINITE = 5, /* the state, the gyro or the set-point; or the quaternion is none */
+    STOCK_SELFTEST = 6,   /* this build does not compute the policy that was verified */
 };
 
 static @name@_state memory; /* of the policy */
 static float held[4];       /* normalizedForces of its last step */
-static control_t stock;     /* of the stock controller: it writes some fields at some steps only, and relies on the rest */
+static control_t stock;     /* the stock controller's own: it writes some of it at some steps only */
 
 static bool tested;
 static uint8_t who = STOCK_UNARMED;
@@ -168,8 +168,7 @@ static void observe(const setpoint_t *setpoint, const sensorData_t *sensors, con
            state->velocity.z - setpoint->velocity.z, &obs[@NAME@_OBS_VX]);
     obs[@NAME@_OBS_WX] = sensors->gyro.x * RAD_PER_DEG;
     obs[@NAME@_OBS_WY] = sensors->gyro.y * RAD_PER_DEG;
-    obs[@NAME@_OBS_WZ] = sensors->gyro.z * RAD_PER_DEG;
-@preview@
+    obs[@NAME@_OBS_WZ] = sensors->gyro.z * RAD_PER_DEG;@preview@
 }
 
 /* An action as a fraction of THRUST_MAX, for normalizedForces. */
@@ -216,8 +215,8 @@ void controllerOutOfTreeInit(void) {
     fault = STOCK_UNARMED;
 }
 
-/* Of the policy there is no more to test here: at boot this runs in a task of 1,200 bytes of stack, and the self-test takes
-   most of it. The app's own task runs it; until it has passed, the policy does not fly. */
+/* At boot this runs in a task of 1,200 bytes of stack, most of which the policy's self-test takes. So the app's own task
+   runs that; until it has passed, the policy does not fly. */
 bool controllerOutOfTreeTest(void) {
     return controllerPidTest();
 }
