@@ -200,6 +200,8 @@ def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], input
     said = {(port["unit"], port.get("quantity")) for port in manifest["act"]}
     assert said == ({("1", "rotor speed fraction")} if task == "any" else {("N", None)})
     assert manifest["memory"]["integral"]["circle_m"] == (1.0 if task == "circle" else None)
+    assert {path.name for path in (run / "export" / "crazyflie" / "src").iterdir()} > {manifest["name"] + ".c"}
+    assert "`crazyflie/` is an app" in (run / "export" / "report.md").read_text()
 
 
 @pytest.mark.parametrize("name", shipped_vehicles())

@@ -18,7 +18,7 @@ from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun, flown_inputs
-from qrl.export import emit, vectors
+from qrl.export import crazyflie, emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import Ints, Kernel
@@ -52,6 +52,8 @@ def export(args: argparse.Namespace) -> int:
         memory = f"{cost.flash:>6,} B {max(cost.stack):>5} B {cost.state:>4} B"
         console.print(f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {memory}")
     duration = clock(time.perf_counter() - start_time)
+    if (run.folder / "export" / crazyflie.FOLDER).is_dir():
+        console.print(f"Crazyflie: {run.folder / 'export' / crazyflie.FOLDER} is an app for its firmware")
     console.print(f"done in {duration}: {run.folder / 'export'}/{name}.c, .h, report.md")
     return DONE
 
@@ -85,13 +87,15 @@ def export_run(
     target = run.folder / "export"
     with TemporaryDirectory(dir=run.folder, prefix=".export-") as scratch, ThreadPoolExecutor(1) as pool:
         folder = Path(scratch) / "export"
-        _write(folder, emit.files(policy, kernel, vectors.golden(policy, kernel), name))
+        emitted = emit.files(policy, kernel, vectors.golden(policy, kernel), name)
+        _write(folder, emitted)
+        _write(folder, crazyflie.files(policy, emitted, name))
         (folder / f"{name}.onnx").write_bytes(portable.onnx_model(policy))
         (folder / f"{name}.npz").write_bytes(portable.arrays(policy))
         log("compiling and verifying; flying")
         verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)
-        _write(folder, {"report.md": report(policy, kernel, measured, name)})
+        _write(folder, {"report.md": report(policy, kernel, measured, name) + crazyflie.section(policy)})
         previous = Path(scratch) / "previous"
         if target.exists():
             target.replace(previous)

@@ -1,0 +1,306 @@
+"""The app for a Crazyflie: an out-of-tree controller of crazyflie-firmware around a kernel (docs/crazyflie.md).
+
+Facts of the firmware are those of its release 2026.08: `src/platform/interface/platform_defaults_*.h`,
+`src/modules/src/power_distribution_quadrotor.c`.
+"""
+
+import math
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from qrl.export.policy import ActionSpec, Policy
+
+TEMPLATES = Path(__file__).parent / "firmware" / "crazyflie"
+FOLDER = "crazyflie"
+RELEASE = "2026.08"
+# Its motors M1 to M4: the signs of body x and y, and of the reaction torque about body z; NAMES says them.
+MOTORS = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
+NAMES = ("front right", "back right", "back left", "front left")
+MEASURED = [
+    *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
+    *(f"{quantity}{axis}" for quantity in "pvw" for axis in "xyz"),
+]
+MOST_ARM_RATIO = 1.3  # of a motor's distance from the center, by which a vehicle may differ from the platform
+MOST_HOVER = 0.8  # of a motor's greatest thrust
+MAIN_LOOP_US = 1000
+GRAVITY_M_S2 = 9.81
+
+
+class Platform(NamedTuple):
+    """A build of the firmware."""
+
+    title: str
+    defconfig: str
+    config: str  # besides, in app-config
+    guard: str  # true in the preprocessor for this build
+    thrust_max_N: float  # of each motor
+    mass_kg: float
+    arm_m: float  # from the center to a motor
+    thrust_curve: float  # c of thrust/max = c·w + (1 − c)·w², w the rotor speed/max: crazyflow 0.4.0, identified
+
+
+PLATFORMS = (
+    Platform(
+        "Crazyflie 2.1+ or 2.X with its propellers",
+        "cf2_defconfig",
+        "CONFIG_CRAZYFLIE_21_PLUS=y",
+        "defined(CONFIG_PLATFORM_CF2) && !defined(CONFIG_CRAZYFLIE_THRUST_UPGRADE_KIT)",
+        0.12,
+        0.029,
+        0.046,
+        -0.1041,
+    ),
+    Platform(
+        "Crazyflie 2.1 with the thrust upgrade kit",
+        "cf2_defconfig",
+        "CONFIG_CRAZYFLIE_THRUST_UPGRADE_KIT=y",
+        "defined(CONFIG_PLATFORM_CF2) && defined(CONFIG_CRAZYFLIE_THRUST_UPGRADE_KIT)",
+        0.18,
+        0.0325,
+        0.046,
+        -0.1041,
+    ),
+    Platform(
+        "Crazyflie 2.1 Brushless",
+        "cf21bl_defconfig",
+        "",
+        "defined(CONFIG_PLATFORM_CF21BL)",
+        0.2,
+        0.0393,
+        0.050,
+        -0.0339,
+    ),
+)
+
+
+def any_vehicle(policy: Policy) -> bool:
+    """Whether it orders rotor speeds, so that it fits each platform."""
+    return all(port.quantity == "rotor speed fraction" for port in policy.actions)
+
+
+def refusal(policy: Policy) -> str | None:
+    """Why a policy cannot fly on a Crazyflie, in one line; None if it can."""
+    names = [port.name for port in policy.observations]
+    previews = [(axis, k) for k, axis in enumerate(port.name[-1] for port in policy.observations[18:])]
+    if names[:18] != MEASURED or any(port.ahead_s is None for port in policy.observations[18:]) or len(previews) % 3:
+        return "the observation is not a vehicle's state, and previews of a reference"
+    if len(policy.actions) != 4:
+        return f"a Crazyflie has four motors, and the policy {len(policy.actions)}"
+    if not (any_vehicle(policy) or all(port.unit == "N" for port in policy.actions)):
+        return "the motors are ordered neither thrusts [N] nor fractions of their greatest speed"
+    period_us = round(policy.control_period_s * 1e6)
+    if period_us % MAIN_LOOP_US or period_us < MAIN_LOOP_US:
+        return f"a control period of {policy.control_period_s * 1e3:g} ms is no whole number of the main loop's 1 ms"
+    order = motor_order(policy)
+    if isinstance(order, str):
+        return order
+    if any_vehicle(policy):
+        return None
+    hover_N = max(port.safe for port in policy.actions)
+    most_N = max(platform.thrust_max_N for platform in PLATFORMS)
+    if hover_N > MOST_HOVER * most_N:
+        return f"hover takes {hover_N:.3g} N of a motor, and a Crazyflie's have at most {most_N:g} N"
+    if not _fitting(policy):
+        least, greatest = (f"{pick(p.arm_m for p in PLATFORMS) * 1e3:.0f}" for pick in (min, max))
+        return (
+            f"the motors are {arm_m(policy) * 1e3:.0f} mm from the center, and a Crazyflie's {least} to {greatest} mm"
+        )
+    return None
+
+
+def motor_order(policy: Policy) -> list[int] | str:
+    """The action of each of M1 to M4, by position and spin; or why there is none."""
+    found = [_quadrant(port) for port in policy.actions]
+    order = []
+    for number, (x, y, spin) in enumerate(MOTORS, 1):
+        there = [i for i, place in enumerate(found) if place and place[:2] == (x, y)]
+        if len(there) != 1:
+            return f"a Crazyflie has one motor {NAMES[number - 1]} (M{number}), and the vehicle {len(there)}"
+        if found[there[0]] != (x, y, spin):
+            return (
+                f"a Crazyflie's motor {NAMES[number - 1]} (M{number}) has spin {spin:+d}, and the vehicle's"
+                f" ({policy.actions[there[0]].name}) {-spin:+d}"
+            )
+        order.append(there[0])
+    return order
+
+
+def _quadrant(port: ActionSpec) -> tuple[int, int, int | None] | None:
+    """Signs of a motor's x and y, and its spin; None if it has no place off the axes."""
+    if port.position_m is None or 0.0 in port.position_m[:2]:
+        return None
+    x, y = (int(math.copysign(1, value)) for value in port.position_m[:2])
+    return x, y, port.spin
+
+
+def arm_m(policy: Policy) -> float:
+    """Mean distance of the motors from the body's z axis."""
+    return sum(math.hypot(*(port.position_m or (0.0, 0.0))[:2]) for port in policy.actions) / len(policy.actions)
+
+
+def mass_kg(policy: Policy) -> float:
+    """That the hover thrusts lift."""
+    return sum(port.safe for port in policy.actions) / GRAVITY_M_S2
+
+
+def _fitting(policy: Policy) -> list[Platform]:
+    """The platforms that a policy in newtons can fly on, the nearest in mass, size and thrust first."""
+    hover_N, limit_N = max(port.safe for port in policy.actions), max(port.high for port in policy.actions)
+
+    def distance(platform: Platform) -> float:
+        pairs = (mass_kg(policy), platform.mass_kg), (arm_m(policy), platform.arm_m), (limit_N, platform.thrust_max_N)
+        return sum(abs(math.log(a / b)) for a, b in pairs)
+
+    fit = [
+        platform
+        for platform in PLATFORMS
+        if hover_N <= MOST_HOVER * platform.thrust_max_N
+        and 1 / MOST_ARM_RATIO <= arm_m(policy) / platform.arm_m <= MOST_ARM_RATIO
+    ]
+    return sorted(fit, key=distance)
+
+
+def platform(policy: Policy) -> Platform | None:
+    """The build that a policy is for; None: any of `PLATFORMS`."""
+    return None if any_vehicle(policy) else _fitting(policy)[0]
+
+
+def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
+    """The app of a policy: path in the export folder -> text; none with a `refusal`. `kernel`: NAME.c and NAME.h."""
+    if refusal(policy):
+        return {}
+    values = _values(policy, name)
+    templates = {path.relative_to(TEMPLATES).as_posix(): path for path in TEMPLATES.rglob("*") if path.is_file()}
+    app = {
+        f"{FOLDER}/{path.replace('NAME', name)}": re.sub(
+            r"@(\w+)@", lambda match: values[match[1]], file.read_text(encoding="utf-8")
+        )
+        for path, file in templates.items()
+    }
+    return app | {f"{FOLDER}/src/{file}": kernel[file] for file in (f"{name}.c", f"{name}.h")}
+
+
+def section(policy: Policy) -> str:
+    """What report.md says of it; nothing of a policy that flies no vehicle."""
+    if any(port.spin is None for port in policy.actions):
+        return ""
+    reason = refusal(policy)
+    lines = [f"No app: {reason}."] if reason else [f"`{FOLDER}/` is an app; its README says how to build it.", ""]
+    lines += [] if reason else [f"- {fact}" for fact in facts(policy)]
+    return "\n## Crazyflie\n\n" + "\n".join(lines) + "\n"
+
+
+def _values(policy: Policy, name: str) -> dict[str, str]:
+    """Values of the templates' @placeholders@."""
+    order = motor_order(policy)
+    assert not isinstance(order, str), order
+    build = platform(policy)
+    return {
+        "name": name,
+        "NAME": name.upper(),
+        "period_ms": f"{policy.control_period_s * 1e3:.0f}",
+        **{f"m{number}": policy.actions[i].name.upper() for number, i in enumerate(order, 1)},
+        "preview": _preview(policy, name),
+        "fraction": _fraction(policy),
+        "platform_guard": _guard(policy, build),
+        "platform_config": f"\n{build.config}" if build and build.config else "",
+        "defconfig": build.defconfig if build else "cf2_defconfig",
+        "image": "build/" + (build.defconfig if build else "cf2_defconfig").replace("_defconfig", ".bin"),
+        "facts": "\n".join(f"- {line}" for line in facts(policy)),
+        "build": _build(build),
+        "release": RELEASE,
+    }
+
+
+def _preview(policy: Policy, name: str) -> str:
+    """C that fills in the previews."""
+    ports = policy.observations[18::3]
+    if not ports:
+        return ""
+    times = ", ".join(f"{port.ahead_s:g}f" if "." in f"{port.ahead_s:g}" else f"{port.ahead_s:g}.0f" for port in ports)
+    return PREVIEW.format(NAME=name.upper(), times=times, count=len(ports))
+
+
+PREVIEW = """
+
+    /* A set-point does not tell what comes: the reference is taken to go on with its acceleration and jerk. */
+    static const float ahead_s[] = {{{times}}};
+    for (int k = 0; k < {count}; ++k) {{
+        const float t = ahead_s[k], half = 0.5f * t * t;
+        turned(heading, setpoint->acceleration.x * t + setpoint->jerk.x * half,
+               setpoint->acceleration.y * t + setpoint->jerk.y * half,
+               setpoint->acceleration.z * t + setpoint->jerk.z * half, &obs[{NAME}_OBS_D1X + 3 * k]);
+    }}"""
+
+
+def _fraction(policy: Policy) -> str:
+    """C that turns an action into a fraction of THRUST_MAX."""
+    if not any_vehicle(policy):
+        return "    const float share = action / THRUST_MAX; /* newtons */"
+    brushed, *_, brushless = PLATFORMS
+    return FRACTION.format(brushless=f"{brushless.thrust_curve:g}f", brushed=f"{brushed.thrust_curve:g}f")
+
+
+FRACTION = """\
+    /* A rotor speed, of that at which the rotor gives THRUST_MAX; thrust = c w + (1 - c) w^2, c as identified. */
+#ifdef CONFIG_PLATFORM_CF21BL
+    const float c = {brushless};
+#else
+    const float c = {brushed};
+#endif
+    const float share = action * (c + (1.0f - c) * action);"""
+
+
+def _guard(policy: Policy, build: Platform | None) -> str:
+    """C that refuses a build for another platform."""
+    if build is None:
+        return ""
+    limit_N = max(port.high for port in policy.actions)
+    trained = f"{mass_kg(policy) * 1e3:.1f} g with motors of up to {limit_N:g} N"
+    return f"""#if !({build.guard})
+#error "Trained to fly {trained}: build for the {build.title} ({build.defconfig})"
+#endif
+"""
+
+
+def facts(policy: Policy) -> list[str]:
+    """What its pilot must know of the policy, a sentence each."""
+    run, about = policy.provenance, policy.observations[9].frame
+    found = [
+        f"{' '.join(run.task.split())}: {' '.join(run.description.split())}.",
+        f"The set-point's position is {about.removeprefix('world: position from ')}.",
+        f"The policy runs every {policy.control_period_s * 1e3:.0f} ms; the motors hold between.",
+    ]
+    build = platform(policy)
+    if build is None:
+        found.append("It orders rotor speeds and was trained on many vehicles: it flies each Crazyflie.")
+    else:
+        limit_N = max(port.high for port in policy.actions)
+        found.append(
+            f"Trained to fly {mass_kg(policy) * 1e3:.1f} g, motors {arm_m(policy) * 1e3:.0f} mm from the center and of"
+            f" up to {limit_N:g} N, for the {build.title}: {build.mass_kg * 1e3:.1f} g,"
+            f" {build.arm_m * 1e3:.0f} mm, {build.thrust_max_N:g} N. Weigh yours."
+        )
+        if limit_N > 1.01 * build.thrust_max_N:
+            found.append(
+                f"Its orders above {build.thrust_max_N:g} N are cut: it has less thrust than it was trained with."
+            )
+        if policy.memory is None or not (policy.memory.integral or policy.memory.units):
+            found.append("It has no integral and no recurrent memory: a vehicle of another mass flies at an offset.")
+    if len(policy.observations) > 18:
+        most_s = max(port.ahead_s or 0.0 for port in policy.observations)
+        found.append(
+            f"It looks up to {most_s:g} s ahead, of which set-points say nothing: the reference is taken to go on with"
+            " the acceleration and jerk of the set-point. That is exact at rest."
+        )
+    return found
+
+
+def _build(build: Platform | None) -> str:
+    if build is None:
+        return (
+            "`cf2_defconfig` for a Crazyflie 2.1+ or 2.X, `cf21bl_defconfig` for a 2.1 Brushless; with the thrust"
+            " upgrade kit add `CONFIG_CRAZYFLIE_THRUST_UPGRADE_KIT=y` to `app-config`."
+        )
+    return f"`{build.defconfig}`: {build.title}. `src/` refuses another platform."

@@ -1,0 +1,3 @@
+#pragma once
+int consolePrintf(const char *format, ...);
+#define DEBUG_PRINT(format, ...) consolePrintf(DEBUG_MODULE ": " format, ##__VA_ARGS__)

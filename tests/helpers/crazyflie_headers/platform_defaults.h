@@ -1,0 +1,9 @@
+#pragma once
+#define CONFIG_ENABLE_THRUST_BAT_COMPENSATED 1
+#ifdef CONFIG_PLATFORM_CF21BL
+#define THRUST_MIN 0.02136263f /* N */
+#define THRUST_MAX 0.2f
+#else
+#define THRUST_MIN 0.01281758f
+#define THRUST_MAX 0.12f
+#endif
