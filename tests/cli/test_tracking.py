@@ -43,4 +43,4 @@ def test_what_cannot_be_flown_is_said_in_a_line(run: Path, trained: Path, capsys
     assert "--vehicle: expected a policy of any vehicle" in complaint(capsys, "evaluate", trained, "--vehicle", "hexa")
     assert "--reference: expected a task that tracks" in complaint(capsys, "view", trained, "--reference", "eight")
     assert "has no reference" in complaint(capsys, "train", "hover", "--reference", "eight", "--out", run.parent / "no")
-    assert "four motors" in complaint(capsys, "train", "any", "--vehicle", "hexa", "--out", run.parent / "no")
+    assert "in each quarter" in complaint(capsys, "train", "any", "--vehicle", "hexa", "--out", run.parent / "no")
