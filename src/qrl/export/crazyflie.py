@@ -265,7 +265,7 @@ def _guard(policy: Policy, build: Platform | None) -> str:
 
 
 def facts(policy: Policy) -> list[str]:
-    """What its pilot must know of the policy, a sentence each."""
+    """What to know of the policy before flight, a sentence each."""
     run, about = policy.provenance, policy.observations[9].frame
     found = [
         f"{' '.join(run.task.split())}: {' '.join(run.description.split())}.",
