@@ -159,7 +159,7 @@ def run_core(
     symbols |= {"FLASH_BYTES": core.flash_bytes, "RAM_BYTES": core.ram_bytes}
     memory = [f"-Wl,--defsym={name}={value}" for name, value in symbols.items()]
     link = ["-nostdlib", "-T", str(SOURCES / script), *memory, *libraries, "-lc", "-lgcc"]
-    sources = _sources(kernel, folder, platform)
+    sources = _sources(kernel, folder, platform, "core.c")
     _build([f"{tools.prefix}gcc", *core.flags, *flags, *sources, *link, "-o", "kernel.elf"], folder, core.name)
     qemu = [tools.emulator, "-machine", core.machine, "-display", "none", "-monitor", "none", "-serial", "none"]
     semihosting = ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native"]
@@ -195,9 +195,9 @@ def _folder(kernel: Path, work: Path, name: str, given: Observations) -> Path:
     return folder
 
 
-def _sources(kernel: Path, folder: Path, platform: str) -> list[str]:
+def _sources(kernel: Path, folder: Path, *platform: str) -> list[str]:
     places = [f"-I{folder.resolve()}", f"-I{kernel.resolve().parent}"]
-    return [*places, str(kernel.resolve()), str(SOURCES / "harness.c"), str(SOURCES / platform)]
+    return [*places, str(kernel.resolve()), str(SOURCES / "harness.c"), *(str(SOURCES / name) for name in platform)]
 
 
 def _build(command: list[str], folder: Path, where: str) -> str:

@@ -1,15 +1,12 @@
-/* The harness's platform on a Cortex-M under QEMU: start-up, semihosting, the tick counter and a painted stack. */
-#include "kernel_under_test.h"
-#include "platform.h"
+/* A Cortex-M under QEMU: start-up, semihosting and the tick counter. */
+#include "core.h"
 
 /* Addresses from the linker, in a table: compilers assume that different symbols have different addresses. */
 extern struct {
-    uint32_t *data, *data_end, *data_image, *bss, *bss_end, *stack, *stack_end;
+    uint32_t *data, *data_end, *data_image, *bss, *bss_end;
 } const layout;
 
-int main(void);
 void reset(void) __attribute__((noreturn));
-void fault(void) __attribute__((noreturn));
 
 __asm__(".section .vectors, \"a\"\n"
         ".word main_stack_end\n"
@@ -17,13 +14,12 @@ __asm__(".section .vectors, \"a\"\n"
         ".rept 14\n"
         ".word fault\n"
         ".endr\n"
-        "layout: .word data_start, data_end, data_image, bss_start, bss_end, kernel_stack, kernel_stack_end\n"
+        "layout: .word data_start, data_end, data_image, bss_start, bss_end\n"
+        ".globl kernel_stack_bounds\n"
+        "kernel_stack_bounds: .word kernel_stack, kernel_stack_end\n"
         ".text\n");
 
-enum { OPEN = 1, CLOSE = 2, WRITE0 = 4, WRITE = 5, READ = 6, EXIT_EXTENDED = 0x20, APPLICATION_EXIT = 0x20026 };
-
-/* One request to QEMU, Arm's semihosting; `arguments` are words in the order of Arm's specification. */
-static int32_t semihost(int32_t request, const void *arguments)
+int32_t semihost(int32_t request, const void *arguments)
 {
     register int32_t r0 __asm__("r0") = request;
     register const void *r1 __asm__("r1") = arguments;
@@ -31,54 +27,9 @@ static int32_t semihost(int32_t request, const void *arguments)
     return r0;
 }
 
-intptr_t file_open(const char *name, int writing)
-{
-    uintptr_t length = 0;
-    while (name[length] != 0) {
-        length++;
-    }
-    uintptr_t arguments[3] = {(uintptr_t)name, writing ? 5 : 1, length}; /* as fopen's "wb" and "rb" */
-    return semihost(OPEN, arguments) + 1;                                /* -1: failed; 0 is a valid handle */
-}
-
-uint32_t file_read(intptr_t file, void *into, uint32_t bytes)
-{
-    uintptr_t arguments[3] = {(uintptr_t)(file - 1), (uintptr_t)into, bytes};
-    return bytes - (uint32_t)semihost(READ, arguments);
-}
-
-uint32_t file_write(intptr_t file, const void *from, uint32_t bytes)
-{
-    uintptr_t arguments[3] = {(uintptr_t)(file - 1), (uintptr_t)from, bytes};
-    return bytes - (uint32_t)semihost(WRITE, arguments);
-}
-
-int file_close(intptr_t file)
-{
-    uintptr_t argument = (uintptr_t)(file - 1);
-    return (int)semihost(CLOSE, &argument);
-}
-
-void print_text(const char *text) { semihost(WRITE0, text); }
-
-void finish(int code)
-{
-    uintptr_t arguments[2] = {APPLICATION_EXIT, (uintptr_t)code};
-    for (;;) {
-        semihost(EXIT_EXTENDED, arguments);
-    }
-}
-
-void fault(void)
-{
-    print_text("qrl-error: processor fault\n");
-    finish(1);
-}
-
-/* timed(arguments, function, elapsed): the result of the function of three arguments. Waits for an edge of SysTick,
-   calls the function on the kernel's stack, and counts rounds of four instructions until the next edge. */
-int timed(const void *const arguments[3], void (*function)(void), struct elapsed *elapsed);
+/* timed: waits for an edge of SysTick, calls the function, and counts rounds of four instructions until the next edge. */
 __asm__(".syntax unified\n"
+        ".globl timed, known\n"
         ".thumb_func\n"
         "timed:\n"
         "    push {r4-r7, lr}\n"
@@ -111,8 +62,6 @@ __asm__(".syntax unified\n"
         "    pop  {r4-r7, pc}\n"
         "    .pool\n");
 
-/* known(rounds): 2 * rounds + 3 instructions. */
-int known(uint32_t rounds);
 __asm__(".thumb_func\n"
         "known:\n"
         "    cmp  r0, #0\n"
@@ -120,40 +69,6 @@ __asm__(".thumb_func\n"
         "1:  subs r0, #1\n"
         "    bne  1b\n"
         "2:  bx   lr\n");
-
-int call(enum entry entry, void *state, const void *obs, void *act, struct elapsed *elapsed)
-{
-    static void (*const functions[])(void) = {
-        [STEP] = (void (*)(void))kernel_step,
-        [STEP_I16] = (void (*)(void))kernel_step_i16,
-        [SELFTEST] = (void (*)(void))kernel_selftest,
-        [KNOWN] = (void (*)(void))known,
-    };
-    const void *const arguments[3] = {state, obs, act};
-    return timed(arguments, functions[entry], elapsed);
-}
-
-#define PAINT 0xC5A5A5C5u
-
-void stack_paint(void)
-{
-    for (volatile uint32_t *word = layout.stack; word != layout.stack_end; word++) {
-        *word = PAINT;
-    }
-}
-
-int32_t stack_depth(void)
-{
-    const volatile uint32_t *word = layout.stack;
-    while (word != layout.stack_end && *word == PAINT) {
-        word++;
-    }
-    if (word == layout.stack) {
-        print_text("qrl-error: stack overflow: all of the stack was used\n");
-        finish(1);
-    }
-    return (int32_t)((uintptr_t)layout.stack_end - (uintptr_t)word);
-}
 
 void reset(void)
 {

@@ -1,5 +1,5 @@
 /* The harness's platform: files, text output, and measured calls.
-   Implemented by host.c for a workstation, by cortex_m.c and risc_v.c for cores under QEMU. */
+   Implemented by host.c for a workstation, by core.c, with cortex_m.c or risc_v.c, for cores under QEMU. */
 #ifndef PLATFORM_H
 #define PLATFORM_H
 
