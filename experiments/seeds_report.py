@@ -2,16 +2,15 @@
 
 import math
 import textwrap
-import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib.ticker import EngFormatter, PercentFormatter
-from scipy import stats
 
 from experiments.output import atomic_write, table
+from experiments.statistics import interquartile_mean
 from qrl.evaluation.starts import STARTS
 from qrl.runs import files, record
 from qrl.runs.learning_curve import BLUE, GREEN, empty_figure, plain_style
@@ -68,19 +67,8 @@ def statistics(rows: list[Row]) -> dict[str, Row]:
         if values:
             worst = max(values, key=lambda seed: sign * values[seed])
             found[key] = {"median": float(np.median([*values.values()])), "worst": values[worst], "worst_seed": worst}
-            found[key] |= interquartile_mean(np.array([*values.values()]))
+            found[key] |= interquartile_mean(np.array([*values.values()]))._asdict()
     return found
-
-
-def interquartile_mean(values: np.ndarray) -> dict[str, float]:
-    """The mean of the middle half, and its percentile bootstrap; the interval of one value is NaN."""
-    iqm = partial(stats.trim_mean, proportiontocut=0.25)
-    low = high = math.nan
-    if len(values) > 1:
-        with warnings.catch_warnings(action="ignore"), np.errstate(invalid="ignore"):  # about what is infinite
-            interval = stats.bootstrap((values,), iqm, method="percentile", rng=np.random.default_rng(0))
-        low, high = map(float, interval.confidence_interval)
-    return {"iqm": float(iqm(values)), "low": low, "high": high}
 
 
 def number(value: float) -> str:

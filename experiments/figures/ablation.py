@@ -12,7 +12,7 @@ import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from experiments.arguments import Parser, run_main
 from experiments.figures import runs as figure_runs
 from experiments.figures.runs import CODE, ROOT, Failed
 from experiments.output import table
+from experiments.statistics import format_interval
 from qrl.config import load_preset
 from qrl.runs import files, record
 
@@ -112,26 +113,21 @@ def page(found: dict[str, dict[str, Row]]) -> str:
     for task in found:
         file = json.loads(grid(task).read_text())
         steps = file["fixed"].get("num_timesteps") or load_preset(task)["num_timesteps"]
+        seeds, command = file["seeds"], f"qrl sweep experiments/grids/{grid(task).name}"
         lines.append(
-            f"{task}: {steps:,} steps, {file['seeds']} seeds, `qrl sweep experiments/grids/{grid(task).name}`,"
-            " evaluated from the starts of a run's reports after the last step."
+            f"{task}: {steps:,} steps, seeds {seeds[0]}–{seeds[-1]}, `{command}`, evaluated from the starts of a run's"
+            " reports after the last step."
         )
     versions = ", ".join(f"{name} {version}" for name, version in record.versions().items())
-    return "\n".join([*lines, "", f"Median [min … max] over seeds. Versions: {versions}.", ""])
+    lines += ["", f"Interquartile mean [its bootstrap interval of 95 %] over seeds. Versions: {versions}.", ""]
+    return "\n".join(lines)
 
 
 def cells_of(row: Row | None) -> tuple[str, str]:
     if row is None:
         return "–", "–"
     diverged = f"; {row.diverged} of {len(row.returns)} diverged" if row.diverged else ""
-    return spread(row.returns) + diverged, spread(100.0 * row.success, ".0f")
-
-
-def spread(values: Any, form: str = ".1f") -> str:
-    """Median [min … max]; a dash where nothing was measured."""
-    if np.isnan(values).any():
-        return "–"
-    return f"{np.median(values):{form}} [{values.min():{form}} … {values.max():{form}}]"
+    return format_interval(row.returns) + diverged, format_interval(100.0 * row.success, ".0f")
 
 
 if __name__ == "__main__":

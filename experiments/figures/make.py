@@ -141,7 +141,7 @@ def draw_figure(
 def curves(source: Source, label: str = "") -> Curves:
     steps, returns = reports(source.folder, "return_mean")
     _, success = reports(source.folder, "success")
-    return Curves(label or f"median and quartiles of {len(returns)} seeds", steps, returns, success)
+    return Curves(label or f"IQM of {len(returns)} seeds", steps, returns, success)
 
 
 def rates(sources: list[Source]) -> list[Rate]:

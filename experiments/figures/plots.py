@@ -15,6 +15,7 @@ from matplotlib.ticker import FuncFormatter
 
 from experiments.figures.flights import PolicyFlights
 from experiments.output import atomic_write
+from experiments.statistics import interquartile_mean
 from qrl_envs.plots.frame import COLORS, INK
 from qrl_envs.task import CircleReward
 
@@ -68,12 +69,9 @@ class Rate(NamedTuple):
     ppo: Curves
 
 
-def quartiles(values: np.ndarray) -> np.ndarray:
-    """Of the finite among `values` [seeds, x] the quartiles [3, x]; NaN where there are none."""
-    found = np.full((3, values.shape[1]), np.nan)
-    seen = np.isfinite(values).any(axis=0)
-    found[:, seen] = np.nanquantile(np.where(np.isfinite(values), values, np.nan)[:, seen], (0.25, 0.5, 0.75), axis=0)
-    return found
+def intervals(values: np.ndarray) -> np.ndarray:
+    """Of the finite among `values` [seeds, x] the interquartile mean and the ends of its interval, [3, x]; else NaN."""
+    return np.array([interquartile_mean(column[np.isfinite(column)]) for column in values.T]).T
 
 
 @contextmanager
@@ -147,10 +145,10 @@ def circle(curves: Curves) -> Figure:
 
 
 def _draw(axes: Axes, steps: np.ndarray, values: np.ndarray, color: str, dash: Any, label: str) -> None:
-    """The median of `values` [seeds, x] and the band between their quartiles."""
-    low, median, high = quartiles(values)
+    """The interquartile mean of `values` [seeds, x], and a band: its bootstrap interval of 95 %."""
+    mean, low, high = intervals(values)
     axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-    axes.plot(steps, median, color=color, linestyle=dash, label=label)
+    axes.plot(steps, mean, color=color, linestyle=dash, label=label)
 
 
 def _share(axes: Axes, curves: Curves) -> None:
@@ -159,9 +157,9 @@ def _share(axes: Axes, curves: Curves) -> None:
 
 
 def _floor(values: np.ndarray) -> float:
-    """Of an axis for `values` [seeds, x]: low enough to show the median after its first sixth."""
-    median = quartiles(values)[1]
-    return float(np.nanmin(median[len(median) // 6 :])) - 10.0
+    """Of an axis for `values` [seeds, x]: low enough to show the mean after its first sixth."""
+    mean = intervals(values)[0]
+    return float(np.nanmin(mean[len(mean) // 6 :])) - 10.0
 
 
 def _steps(axes: Axes) -> None:

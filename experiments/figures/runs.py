@@ -22,7 +22,8 @@ ROOMS = {"qrl": ROOT / "src" / "qrl", "qrl_envs": ROOT / "envs" / "qrl_envs"}
 TRAINING = ("qrl.training.driver", "qrl_envs.env")  # with all that they import: the code that decides a run's numbers
 CODE = "code.sha256"  # in a run's folder: the hash of the code that trained it
 
-SEEDS, FAST_SEEDS = 6, 2  # even, so that two cores share them
+FIRST_SEED = 100  # held out: none was tuned on
+SEEDS, FAST_SEEDS = 10, 2  # even, so that two cores share them
 # Schulman et al. 2017: eight whole passes over the last unroll of 16 lanes, the ratio clipped at 0.2, GAE(0.95). What
 # differs: no entropy bonus, and the step size and sigma of the method that it stands beside.
 PPO = {
@@ -53,7 +54,7 @@ class RunSpec(NamedTuple):
     preset: str  # whose values the flags override
     flags: dict[str, Any]  # of `qrl train`, by the names of qrl.config
     seeds: int = 1
-    seed: int = 0
+    seed: int = FIRST_SEED
 
     @property
     def words(self) -> list[str]:
@@ -64,8 +65,7 @@ class RunSpec(NamedTuple):
             for name, value in self.flags.items()
             for w in (f"--{name.replace('_', '-')}", json.dumps(value).strip('"'))
         ]
-        seed = ["--seed", str(self.seed)] * bool(self.seed)
-        return ["train", self.task, *seed, "--seeds", str(self.seeds), *preset, *flags]
+        return ["train", self.task, "--seed", str(self.seed), "--seeds", str(self.seeds), *preset, *flags]
 
     def config(self) -> RunConfig:
         """The config.json of this run if it were trained now."""
@@ -92,13 +92,16 @@ def plan(*, fast: bool) -> list[RunSpec]:
 
 
 def pendulums(preset: str, seeds: int, *, paper: bool) -> list[RunSpec]:
-    """Both methods at two rates around the recipe's own; with `paper` at the paper's two rates too, held constant."""
+    """Both methods at two rates around the recipe's own; with `paper` at the paper's two rates too, held constant.
+
+    Neither is augmented by symmetries, which the paper's method does not have: what is compared is the objective.
+    """
     recipe = {name: load_preset(preset)[name] for name in ("learning_rate", "learning_rate_end")}
     rates = {"high": recipe, "low": {name: float(f"{value / RATIO:.6g}") for name, value in recipe.items()}}
     if paper:
         constant = {name: {"learning_rate": r, "learning_rate_end": r} for name, r in PAPER_RATES.items()}
         rates |= {f"paper-{name}": rate for name, rate in constant.items()}
-    methods = {"": {}, "-ppo": PPO}
+    methods = {"": {"symmetries": False}, "-ppo": PPO}
     return [
         RunSpec(f"pendulum-{rate}{method}", "pendulum", preset, flags | more, seeds)
         for rate, flags in rates.items()

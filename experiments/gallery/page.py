@@ -72,8 +72,9 @@ def page(
         "",
         table(["figure", "the paper's claim", "here"], claims),
         "",
-        "The figures' policies are trained without APG (the paper's learner, with symmetries): the shipped presets of"
-        " hover and circle end with APG. The paper does not augment trajectories by symmetries.",
+        "The figures' policies are trained without APG: the shipped presets of hover and circle end with APG. Those of"
+        " hover and circle are augmented by the task's symmetries, which the paper's method is not; the pendulum's are"
+        " not.",
         "",
     ]
     for name, caption in captions.items():

@@ -111,8 +111,8 @@ def test_numbers_are_those_of_the_evaluation(made: Path) -> None:
     assert "| steady state, mm | 0.1 | 20.0 | – |" in page
     assert "latency 100.0 %" in page
     assert (
-        "`qrl train hover --seeds 1`, 1,234,000 steps; PPO: `qrl train hover --seeds 1 --preset hover_ppo`,\n99 s"
-        in page
+        "`qrl train hover --seed 100 --seeds 1`, 1,234,000 steps;"
+        " PPO: `qrl train hover --seed 100 --seeds 1 --preset hover_ppo`,\n99 s" in page
     )
     assert "6 starts fail: 12 40 41 90 91 …; `qrl view RUN --starts 12` replays one." in page
 

@@ -14,6 +14,7 @@ import pytest
 
 from cli_helpers import TINY, qrl
 from experiments import seeds, seeds_report
+from experiments.statistics import interquartile_mean
 from qrl.runs import files
 
 # Stands for qrl: writes what a run does. It fails, or waits to be ended or for another seed, as its task's flags say.
@@ -247,11 +248,11 @@ def test_the_interval_is_that_of_all_resamples() -> None:
     """Of four values there are 256 resamples; the middle half of each are its middle two."""
     values = np.array([0.0, 1.0, 2.0, 10.0])
     every = sorted(np.mean(sorted(draw)[1:3]) for draw in itertools.product(values, repeat=4))
-    found = seeds_report.interquartile_mean(values)
-    assert found["iqm"] == 1.5
-    assert (found["low"], found["high"]) == (every[round(0.025 * 255)], every[round(0.975 * 255)])
-    one = seeds_report.interquartile_mean(np.array([3.0]))
-    assert (one["iqm"], math.isnan(one["low"])) == (3.0, True)
+    found = interquartile_mean(values)
+    assert found.iqm == 1.5
+    assert (found.low, found.high) == (every[round(0.025 * 255)], every[round(0.975 * 255)])
+    one = interquartile_mean(np.array([3.0]))
+    assert (one.iqm, math.isnan(one.low)) == (3.0, True)
 
 
 def test_the_share_that_flies_holds_the_last_report(tmp_path: Path) -> None:
