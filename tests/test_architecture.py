@@ -261,13 +261,10 @@ def test_both_packages_are_read(house: House) -> None:
     assert any(imported.name == "jax.numpy" for imported in house.imports["qrl.algorithm.vtrace"])
 
 
-def test_the_package_opens_without_a_cost() -> None:
-    program = (
-        "import sys, time; t = time.perf_counter(); import qrl; print(time.perf_counter() - t, 'jax' in sys.modules)"
-    )
-    seconds, jax = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout.split()
-    assert jax == "False"
-    assert float(seconds) < 0.2
+def test_the_package_and_its_help_load_no_jax() -> None:
+    """JAX takes most of a command's first seconds."""
+    program = "import sys, qrl, qrl_envs, qrl.cli.main as cli; cli.build_parser(); print('jax' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout == "False\n"
 
 
 # Each rule, and each row, seen failing: a file, what it says, and the words that must come of it.

@@ -1,7 +1,7 @@
 """A pendulum and a quadrotor as Brax environments, one for each task file in `tasks/`.
 
-`import qrl_envs` makes `brax.envs.get_environment("hover")` work. It does not import Brax, which takes seconds: the
-import hook below registers the tasks when `brax.envs` is imported, before or after.
+`import qrl_envs` makes `brax.envs.get_environment("hover")` work. It imports neither Brax nor JAX, which take seconds:
+the import hook below registers the tasks when `brax.envs` is imported, before or after.
 """
 
 import functools
@@ -9,11 +9,11 @@ from types import ModuleType
 
 from wrapt import when_imported
 
-from qrl_envs import env, task
-
 
 @when_imported("brax.envs")
 def _register(envs: ModuleType) -> None:
+    from qrl_envs import env, task
+
     envs.Env.register(env.TaskEnv)
     for name in task.shipped():
         envs.register_environment(name, functools.partial(env.make, name))

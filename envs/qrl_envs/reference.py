@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.interpolate import make_interp_spline
 
 from qrl_envs import specfile
 from qrl_envs.specfile import BadInput, Fraction, NonNegative, Positive, Real, Spec
@@ -146,6 +145,8 @@ class Waypoints(Base):
         return float(self._times[-1])
 
     def at(self, times_s: np.ndarray) -> Kinematics:
+        from scipy.interpolate import make_interp_spline  # takes half a second to import
+
         # The interpolant of least integral of the squared snap has pieces of degree 7, with six continuous derivatives
         # at the points (Mellinger and Kumar 2011).
         rest = [(order, np.zeros(3)) for order in (1, 2, 3)]
@@ -217,6 +218,8 @@ class Samples(Base):
         return self.times_s[-1]
 
     def at(self, times_s: np.ndarray) -> Kinematics:
+        from scipy.interpolate import make_interp_spline  # takes half a second to import
+
         spline = make_interp_spline(np.array(self.times_s), np.array(self.position_m), k=3, bc_type="natural")
         inside = np.clip(times_s, 0.0, self.times_s[-1])
         found = [np.asarray(spline(inside, order)) for order in (0, 1, 2)]
