@@ -4,7 +4,6 @@ import csv
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -22,8 +21,8 @@ from qrl.config import FORMER_NAMES
 from qrl.runs import files
 from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import load
-from qrl.sweep.runner import Group, Member, Result
-from qrl.training import driver, multihost, sharding
+from qrl.sweep.runner import Chunk, Local, Member, Progress, Result
+from qrl.training import driver, sharding
 from qrl.training.state import TrainState, member_inputs, stack
 from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
@@ -198,17 +197,12 @@ def test_a_finished_sweep_is_left_as_it_is(done: Path, tmp_path: Path) -> None:
 def test_a_chunk_is_recorded_whole_or_not_at_all(tmp_path: Path, laps: int, recorded: int) -> None:
     """Stopped before its end, even after its first report (lap 5 of 10), it leaves nothing."""
     grid = load(write_grid(tmp_path, {"gamma": [0.9]}), 1e9)
-    env, config = worlds.make("pendulum"), grid.points[0].learner
-    group = Group(make_trainer(env, config), [Member(i, i, member_inputs(env, config)) for i in range(2)])
-    device = jax.devices()[0]
-    programs = runner._compiled(group.trainer, group.members, 2, device)
-    asked, chunks = iter(range(100)), tmp_path / "chunks"
-    chunks.mkdir()
+    asked, events = iter(range(100)), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("qrl.training.driver.CHUNK_SECONDS", 1e-9)  # a lap is one unroll
-        events = list(runner._chunk(group, programs, group.members, 2, device, chunks, lambda: next(asked) >= laps))
-    assert len(events) == laps + (recorded > 0)
-    assert len(runner.finished(chunks)) == recorded
+        done = runner.train(chunk_of(grid, 2), jax.devices()[0], lambda: next(asked) >= laps, events.append)
+    assert sum(isinstance(event, Progress) for event in events) == laps
+    assert (len(done.results) if done else 0) == recorded
 
 
 def test_ctrl_c_ends_with_exit_code_1_and_keeps_its_chunks(tmp_path: Path) -> None:
@@ -252,7 +246,7 @@ def test_a_chunk_that_cannot_be_read_is_made_anew(
 def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid, out = write_grid(tmp_path, {"gamma": [0.9]}), tmp_path / "out"
     out.mkdir()
-    with files.locked(out / "process-0.lock", ""):
+    with files.locked(out / "sweep.lock", ""):
         assert "in use by another sweep" in complaint(capsys, "sweep", grid, "--out", out)
     assert not (out / "grid.json").exists()
 
@@ -298,19 +292,23 @@ def test_a_sweep_of_the_first_version_is_refused(
     assert str(tmp_path / "out" / "grid.json") in said
 
 
+def chunk_of(grid: Any, seeds: int) -> Chunk:
+    """The first point of a grid, with its first seeds."""
+    point, inputs = grid.points[0], member_inputs(worlds.make("pendulum"), grid.points[0].learner)
+    members = [Member(i, i, inputs) for i in range(seeds)]
+    return Chunk(point.task, point.learner, point.static, members, seeds, 0, 1)
+
+
 def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever it raises reaches whoever runs the sweep."""
 
-    def chunk(*_: Any) -> Any:
+    def train(*_: Any) -> Any:
         raise IndexError("of our own")
 
     grid = load(write_grid(tmp_path, {"gamma": [0.9]}), 1e9)
-    env, config = worlds.make("pendulum"), grid.points[0].learner
-    group = Group(make_trainer(env, config), [Member(0, 0, member_inputs(env, config))])
-    monkeypatch.setattr(runner, "_compiled", lambda *_: None)
-    monkeypatch.setattr(runner, "_chunk", chunk)
+    monkeypatch.setattr(runner, "train", train)
     with pytest.raises(IndexError, match="of our own"):
-        list(runner.run(group, jax.devices(), 1e9, tmp_path / "chunks", lambda: False))
+        list(Local(1e9).run([chunk_of(grid, 1)], tmp_path / "chunks", lambda: False))
 
 
 # -- memory --------------------------------------------------------------------------------------------------
@@ -330,7 +328,7 @@ def test_a_member_too_large_for_the_budget_is_refused(tmp_path: Path, capsys: py
 @pytest.mark.parametrize("workers", [1, 2, 5])
 @pytest.mark.parametrize("budget", [1e3, 1e4, 1e6])
 def test_chunks_keep_to_the_budget(members: int, workers: int, budget: float) -> None:
-    size = runner.chunk_members(members, 300, budget, workers)
+    size = runner.chunk_members(members, 300, budget, workers, on_cpu=True)
     assert size == 0 or (size + 1) * workers * 300 <= budget
     assert size <= runner.CPU_CHUNK
     if size == 0:
@@ -479,78 +477,3 @@ def test_the_plot_fits_the_axes(tmp_path: Path, places: list[dict], panels: int)
         assert {0.0, 1.0} <= set(heights)
     plot.sweep(tmp_path / "sweep.png", found, "title")
     assert (tmp_path / "sweep.png").stat().st_size > 1000
-
-
-# -- several processes ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("flags", "env", "expected"),
-    [
-        ((None, None, None), {}, (0, 1, "")),
-        ((1, 4, "host:1"), {}, (1, 4, "host:1")),
-        (
-            (None, None, None),
-            {"JAX_PROCESS_ID": "2", "JAX_NUM_PROCESSES": "3", "JAX_COORDINATOR_ADDRESS": "h:1"},
-            (2, 3, "h:1"),
-        ),
-        (
-            (0, None, None),
-            {"JAX_PROCESS_ID": "2", "JAX_NUM_PROCESSES": "3", "JAX_COORDINATOR_ADDRESS": "h:1"},
-            (0, 3, "h:1"),
-        ),
-        ((None, None, None), {"SLURM_PROCID": "1", "SLURM_STEP_NUM_TASKS": "2", "SLURM_NTASKS": "2"}, (1, 2, "")),
-        ((None, None, None), {"SLURM_PROCID": "0", "SLURM_NTASKS": "2"}, (0, 1, "")),  # a batch script, without srun
-    ],
-)
-def test_a_process_knows_which_it_is(flags: tuple, env: dict, expected: tuple) -> None:
-    assert multihost.this_process(*flags, env) == expected
-
-
-@pytest.mark.parametrize(
-    ("flags", "env", "words"),
-    [
-        ((2, 2, "h:1"), {}, "--process-id below --processes, found 2 of 2"),
-        ((1, None, "h:1"), {}, "--process-id below --processes"),
-        ((0, 2, None), {}, "--coordinator is missing"),
-        ((None, None, "h:1"), {}, "--processes is missing"),
-        ((None, None, None), {"JAX_PROCESS_ID": "one"}, "--process-id: expected a number, found 'one'"),
-    ],
-)
-def test_a_process_that_cannot_know_is_refused(flags: tuple, env: dict, words: str) -> None:
-    with pytest.raises(BadInput, match=words):
-        multihost.this_process(*flags, env)
-
-
-def test_a_wrong_grid_is_refused_before_the_others_are_waited_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(multihost, "join", lambda process: pytest.fail("joined"))
-    several = ("--processes", "2", "--process-id", "0", "--coordinator", "127.0.0.1:1")
-    assert "unknown key 'gama'" in complaint(capsys, "sweep", write_grid(tmp_path, {"gama": [0.9]}), *several)
-
-
-def test_two_processes_share_a_sweep(done: Path, tmp_path: Path) -> None:
-    """Each makes its own members, at the same time; the results are those of one process, bit for bit."""
-    grid, out = write_grid(tmp_path, AXES), tmp_path / "out"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    cache = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "xla")}
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-m", "qrl", "sweep", grid, "--out", out, "--processes", "2", "--process-id", str(i)]
-            + ["--coordinator", address],
-            env=os.environ | cache,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for i in range(2)
-    ]
-    said = [process.communicate(timeout=200)[0] for process in started]
-    assert [process.returncode for process in started] == [0, 0], said
-    assert rows_of(out / "results.csv") == rows_of(done / "results.csv")
-    members = [set(json.loads(path.read_text())["members"]) for path in (out / "chunks").glob("*.json")]
-    assert sum(len(numbers) for numbers in members) == 12
-    assert {int(n) % 2 for numbers in members for n in numbers if "0" in numbers} == {0}

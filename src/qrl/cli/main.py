@@ -141,13 +141,15 @@ def build_parser() -> _Parser:
     sweep = commands.add_parser("sweep", help="train every point of a grid; rerun to resume")
     sweep.add_argument("grid", type=Path, metavar="GRID", help="grid file, such as experiments/grids/pendulum_lr.json")
     sweep.add_argument("--out", type=Path, metavar="FOLDER", help="folder of the results (default runs/GRID)")
-    memory = "memory of the members (default: half of the devices')"
+    engine = "this machine (local, the default), or a cluster: that of RAY_ADDRESS, else this machine's own"
+    sweep.add_argument("--engine", choices=("local", "ray"), default="local", help=engine)
+    memory = "memory of the members (default: half of the devices'); with --engine ray of each task's (2, on a GPU 8)"
     sweep.add_argument("--memory-gb", type=positive, metavar="GB", help=memory)
-    for command, what in ((train, "one run"), (sweep, "one sweep")):
-        hosts = command.add_argument_group(f"several processes for {what}", "defaults: JAX's or SLURM's variables")
-        hosts.add_argument("--process-id", type=whole_number, metavar="I", help="index of this process, from 0")
-        hosts.add_argument("--processes", type=count, metavar="N", help="number of processes")
-        hosts.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
+
+    hosts = train.add_argument_group("several processes for one run", "defaults: JAX's or SLURM's variables")
+    hosts.add_argument("--process-id", type=whole_number, metavar="I", help="index of this process, from 0")
+    hosts.add_argument("--processes", type=count, metavar="N", help="number of processes")
+    hosts.add_argument("--coordinator", metavar="HOST:PORT", help="address of process 0")
 
     commands.add_parser("tasks", help="list the tasks that can be trained")
     return parser

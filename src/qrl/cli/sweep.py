@@ -1,12 +1,13 @@
 """`qrl sweep`: from a grid file to a folder of results; rerun to resume."""
 
 import argparse
+import importlib.util
 import json
-import os
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -15,51 +16,54 @@ from qrl.cli.terminal import DONE, FAILED, clock, console, plural, print_error, 
 from qrl.runs import files, record
 from qrl.sweep import grid as grids
 from qrl.sweep import plot, results, runner
-from qrl.sweep.grid import Grid
-from qrl.sweep.runner import ChunkDone, Compiling, Group, Member, Progress
-from qrl.training import devices, multihost
-from qrl.training.multihost import Process
+from qrl.sweep.grid import Grid, GridPoint
+from qrl.sweep.runner import Chunk, ChunkDone, Compiling, Member, Progress, Result
+from qrl.sweep.search import Proposals
+from qrl.training import devices
 from qrl.training.state import member_inputs
 from qrl.training.trainer import make_trainer
 from qrl_envs.specfile import BadInput, read
 
 SHOWN = 20  # points in the table on the terminal
-POLL_SECONDS = 0.5  # between two checks of the other processes' results
 
 
 def sweep(args: argparse.Namespace) -> int:
     start_time = time.perf_counter()
-    process = multihost.this_process(args.process_id, args.processes, args.coordinator, os.environ)
     given = args.memory_gb * 1e9 if args.memory_gb is not None else None
-    grid = grids.load(args.grid, given or devices.host_bytes())  # before waiting for other processes
-    multihost.join(process)
-    budget = given or devices.memory_bytes()
+    if args.engine == "ray":
+        if not importlib.util.find_spec("ray"):
+            raise BadInput("--engine ray: needs Ray: pip install 'qrl[ray]'")
+        jax.config.update("jax_platforms", "cpu")  # the accelerators are for the cluster's tasks
+    grid = grids.load(args.grid, devices.host_bytes() if args.engine == "ray" or not given else given)
     out: Path = args.out or Path("runs") / args.grid.stem
     if _holds_sweep(out, grid) and (out / "summary.json").exists() and (out / "sweep.png").exists():
         console.print(f"{out}: complete already; nothing to do")
         return _exit_code(out)
-    groups = _groups(grid, process, budget, args.grid)
-    out.mkdir(parents=True, exist_ok=True)
-    busy = f"{out}: in use by another sweep; wait for its end, or give another OUT"
-    with files.locked(out / f"process-{process.number}.lock", busy):
-        if not _holds_sweep(out, grid) and process.number == 0:
-            here = {"versions": record.versions(), "devices": devices.device_names()}
-            files.write_json(out / "grid.json", {**grid.record, **here})
-        total = len(grid.points) * len(grid.seeds)
-        console.print(
-            f"{plural(len(grid.points), 'point')} × {plural(len(grid.seeds), 'seed')} = {plural(total, 'member')} in"
-            f" {plural(len(groups), 'compiled program')}, {plural(len(devices.workers()), 'worker')} on"
-            f" {jax.local_devices()[0].platform.upper()} -> {out}"
-        )
-        with stop_requested("stopping: finished chunks are kept") as stopped:
-            _train_groups(groups, out, budget, stopped)
-            found = _all_results(out, total, process, stopped)
-        if found is None:
-            console.print("stopped; rerun the same command to resume")
-            return FAILED
-        if process.number:
-            return DONE  # process 0 writes the results
-        return _finish(out, grid, found, args.grid.stem, time.perf_counter() - start_time)
+    engine = _engine(args.engine, given)
+    try:
+        plan = Plan(grid, engine, args.grid)
+        out.mkdir(parents=True, exist_ok=True)
+        with files.locked(out / "sweep.lock", f"{out}: in use by another sweep; wait for its end, or give another OUT"):
+            if not _holds_sweep(out, grid):
+                here = {"versions": record.versions(), "devices": devices.device_names()}
+                files.write_json(out / "grid.json", {**grid.record, **here})
+            console.print(f"{plan.describe()}, {engine.describe()} -> {out}")
+            with stop_requested("stopping: finished chunks are kept") as stopped:
+                found = _train(plan, engine, out / "chunks", stopped)
+            if found is None:
+                console.print("stopped; rerun the same command to resume")
+                return FAILED
+            return _finish(out, plan.grid, found, args.grid.stem, time.perf_counter() - start_time)
+    finally:
+        engine.close()
+
+
+def _engine(name: str, memory_bytes: float | None) -> runner.Engine:
+    if name == "local":
+        return runner.Local(memory_bytes or devices.memory_bytes())
+    from qrl.sweep.ray_engine import Ray
+
+    return Ray(memory_bytes)
 
 
 def _holds_sweep(out: Path, grid: Grid) -> bool:
@@ -77,93 +81,180 @@ def _holds_sweep(out: Path, grid: Grid) -> bool:
     return True
 
 
-def _groups(grid: Grid, process: Process, budget: float, path: Path) -> list[Group]:
-    """This process's members of every program: every n-th, so that no two processes train the same one."""
-    groups = []
-    for indices in grid.groups():
-        first = grid.points[indices[0]]
-        env = tasks.environment(first.task)
-        tasks.check(env, first.learner, f"{path}: at {grids.describe(first.coordinates)}")
-        inputs = {i: member_inputs(tasks.environment(grid.points[i].task), grid.points[i].learner) for i in indices}
-        members = [
-            Member(i * len(grid.seeds) + j, seed, inputs[i]) for i in indices for j, seed in enumerate(grid.seeds)
-        ]
-        trainer = make_trainer(env, first.learner)
-        each, workers = runner.member_bytes(trainer, members[0].inputs), len(devices.workers())
-        if not runner.chunk_members(len(members), each, budget, workers):
-            raise BadInput(
-                f"{path}: expected members that fit into {budget / 1e9:g} GB of memory, found {len(indices):,} points"
-                f" (such as {grids.describe(first.coordinates)}) of which one for each worker"
-                f" needs {2 * each * workers / 1e9:.2g} GB"
+class Plan:
+    """What a sweep has to train: all points of a grid, or a search's, batch by batch."""
+
+    def __init__(self, grid: Grid, engine: runner.Engine, path: Path) -> None:
+        """BadInput if a point cannot be trained, or does not fit into memory; of a search, if one of the probes."""
+        self._given, self._engine, self._path = grid, engine, path
+        self._programs: dict[str, Program] = {}  # by what is static of a point
+        for indices in grid.groups():
+            self._program(grid.points[indices[0]], len(indices))
+        search = grid.file.search
+        self._search = Proposals(search, grid.space.axes) if search and grid.space else None
+        self._points = [] if self._search else grid.points
+        self._batch: range | None = None  # points of the batch under way
+        self._trials = search.trials if search else len(grid.points)
+
+    @property
+    def grid(self) -> Grid:
+        """With the points that were trained."""
+        return replace(self._given, points=self._points)
+
+    @property
+    def members(self) -> int:
+        return self._trials * len(self._given.seeds)
+
+    @property
+    def programs(self) -> int:
+        return len(self._programs)
+
+    def describe(self) -> str:
+        what = plural(self._trials, "trial" if self._search else "point")
+        programs = "" if self._search else f" in {plural(self.programs, 'compiled program')}"
+        return f"{what} × {plural(len(self._given.seeds), 'seed')} = {plural(self.members, 'member')}{programs}"
+
+    def next_batch(self, found: dict[int, Result]) -> list[Chunk] | None:
+        """The chunks of the next batch, without the members that have a result; None if there is no next."""
+        if not self._search:
+            if self._batch is not None:
+                return None
+            self._batch = range(len(self._points))
+            return [chunk for indices in self._given.groups() for chunk in self._group(indices, found)]
+        if self._batch is not None:
+            results = [[found[index] for index in self._members(i)] for i in self._batch]
+            self._search.tell(
+                results, [self.grid.pruned(i, seeds) for i, seeds in zip(self._batch, results, strict=True)]
             )
-        groups.append(Group(trainer, members[process.number :: process.of]))
-    return groups
+        assert self._given.space
+        points = [self._given.space.point(values) for values in self._search.ask()]
+        self._batch = range(len(self._points), len(self._points) + len(points))
+        self._points = self._points + points
+        chunks = [self._trial(i) for i in self._batch if not found.keys() >= {*self._members(i)}]
+        return sorted(chunks, key=lambda chunk: chunk.program) if points else None
+
+    def complete(self, found: dict[int, Result]) -> bool:
+        """Whether all members of the batch under way have a result."""
+        return all(index in found for i in self._batch or () for index in self._members(i))
+
+    def _members(self, point: int) -> range:
+        seeds = len(self._given.seeds)
+        return range(point * seeds, (point + 1) * seeds)
+
+    def _group(self, indices: list[int], found: dict[int, Result]) -> list[Chunk]:
+        """The chunks of points that share a program."""
+        program = self._program(self._points[indices[0]], len(indices))
+        members = [m for i in indices for m in self._trained(i) if m.index not in found]
+        if not members:
+            return []
+        size = self._size(len(members), program.member_bytes)
+        return [program.chunk(members[i : i + size], size) for i in range(0, len(members), size)]
+
+    def _trial(self, point: int) -> Chunk:
+        """All seeds of a trial, which is judged by them all."""
+        assert self._search
+        members = self._trained(point)
+        chunk = self._program(self._points[point], 1).chunk(members, len(members))
+        return replace(chunk, pruning=self._search.pruning())
+
+    def _trained(self, point: int) -> list[Member]:
+        at, seeds = self._points[point], self._given.seeds
+        inputs = member_inputs(tasks.environment(at.task), at.learner)
+        return [Member(index, seed, inputs) for index, seed in zip(self._members(point), seeds, strict=True)]
+
+    def _size(self, members: int, each_bytes: int) -> int:
+        engine = self._engine
+        return runner.chunk_members(members, each_bytes, engine.memory_bytes, engine.workers, on_cpu=engine.on_cpu)
+
+    def _program(self, point: GridPoint, points: int) -> Program:
+        if point.static not in self._programs:
+            env = tasks.environment(point.task)
+            tasks.check(env, point.learner, f"{self._path}: at {grids.describe(point.coordinates)}")
+            each = runner.member_bytes(make_trainer(env, point.learner), member_inputs(env, point.learner))
+            engine, seeds = self._engine, len(self._given.seeds) if self._given.file.search else 1
+            need = runner.chunk_bytes(seeds, each) * engine.workers
+            if need > engine.memory_bytes:
+                trial = f"{plural(seeds, 'seed')} of " if seeds > 1 else ""
+                raise BadInput(
+                    f"{self._path}: expected members that fit into {engine.memory_bytes / 1e9:g} GB of memory, found"
+                    f" {points:,} points (such as {grids.describe(point.coordinates)}) of which {trial}one for each"
+                    f" worker needs {need / 1e9:.2g} GB"
+                )
+            self._programs[point.static] = Program(point, len(self._programs), each)
+        return self._programs[point.static]
 
 
-def _train_groups(groups: list[Group], out: Path, budget: float, stopped: Callable[[], bool]) -> None:
-    """Train every group with progress on the screen: a line for each chunk, and a bar."""
-    kept = runner.finished(
-        out / "chunks", lambda path: console.print(f"{path}: cannot be read; its members are trained again")
+class Program(NamedTuple):
+    """A compiled program: a point that it is made from, its number, and the bytes of each member."""
+
+    point: GridPoint
+    number: int
+    member_bytes: int
+
+    def chunk(self, members: list[Member], size: int) -> Chunk:
+        at, room = self.point, runner.chunk_bytes(size, self.member_bytes)
+        return Chunk(at.task, at.learner, at.static, members, size, self.number, room)
+
+
+def _train(plan: Plan, engine: runner.Engine, folder: Path, stopped: Callable[[], bool]) -> dict[int, Result] | None:
+    """Train batch by batch with progress on the screen: a line for each chunk, and a bar. None if stopped before."""
+    found = runner.finished(
+        folder, lambda path: console.print(f"{path}: cannot be read; its members are trained again")
     )
-    mine = [group.steps for group in groups for member in group.members if member.index in kept]
-    work, total = sum(len(group.members) * group.steps for group in groups), sum(len(group.members) for group in groups)
-    done = before = sum(mine)
-    count, start_time = len(mine), time.perf_counter()
-
-    def eta(now: float) -> str:
-        spent = time.perf_counter() - start_time
-        return clock(spent / (now - before) * (work - now)) if now > before else "–"
-
-    with progress_bar(work, done) as update:
-        for number, group in enumerate(groups):
-            under_way: dict[int, int] = {}  # steps of chunks
-            for event in runner.run(group, devices.workers(), budget, out / "chunks", stopped):
+    total, before, start_time = plan.members, None, time.perf_counter()
+    with progress_bar(total, 0) as update:
+        while (chunks := plan.next_batch(found)) is not None:
+            of = {chunk.index: chunk for chunk in chunks}
+            count = len(plan.grid.points) * len(plan.grid.seeds) - sum(len(chunk.members) for chunk in chunks)
+            before = count if before is None or not chunks else before
+            under_way: dict[int, float] = {}  # members' worth of chunks
+            for event in engine.run(chunks, folder, stopped):
                 match event:
                     case Compiling():
-                        console.print(f"compiling program {number + 1} of {len(groups)}, {event.size} members at once")
+                        which = f"{event.program + 1} of {plan.programs}"
+                        console.print(f"compiling program {which}, {event.size} members at once")
                     case Progress():
-                        under_way[event.chunk] = event.env_steps
-                        now = done + sum(under_way.values())
-                        update(now, f"{count} of {total} members, ETA {eta(now)}")
+                        under_way[event.chunk] = event.env_steps / of[event.chunk].steps
                     case ChunkDone():
                         under_way.pop(event.chunk, None)
-                        done += len(event.results) * group.steps
                         count += len(event.results)
-                        diverged = sum(bool(result.diverged) for result in event.results.values())
-                        console.print(
-                            f"{count:>6} of {total} members done, {clock(event.seconds)} for the last"
-                            f" {len(event.results)}, ETA {eta(done + sum(under_way.values()))}"
-                            f"{f'; {diverged} diverged' if diverged else ''}"
-                        )
-
-
-def _all_results(out: Path, total: int, process: Process, stopped: Callable[[], bool]) -> dict[int, Any] | None:
-    """Every member's result, once all processes are done; None if stopped before."""
-    found = runner.finished(out / "chunks")
-    if len(found) < total and process.of > 1 and not stopped():
-        console.print(f"process {process.number}: waiting for the other processes")
-    while len(found) < total and process.of > 1 and not stopped():
-        time.sleep(POLL_SECONDS)
-        found = runner.finished(out / "chunks")
-    return found if len(found) == total else None
+                spent, now = time.perf_counter() - start_time, count + sum(under_way.values())
+                eta = f"ETA {clock(spent / (now - before) * (total - now)) if now > before else '–'}"
+                update(now, f"{count} of {total} members, {eta}")
+                if isinstance(event, ChunkDone):
+                    diverged = sum(bool(result.diverged) for result in event.results.values())
+                    pruned = any(
+                        result.rows[-1]["env_steps"] < of[event.chunk].steps for result in event.results.values()
+                    )
+                    console.print(
+                        f"{count:>6} of {total} members done, {clock(event.seconds)} for the last"
+                        f" {len(event.results)}, {eta}{'; pruned' if pruned else ''}"
+                        f"{f'; {diverged} diverged' if diverged else ''}"
+                    )
+            found = runner.finished(folder)
+            if not plan.complete(found):
+                return None
+    return found
 
 
 def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
     summaries = results.summaries(grid, found)
     results.write(out, grid, found, summaries, seconds)
     _print_table(summaries, len(grid.seeds))
-    plot.sweep(out / "sweep.png", summaries, f"{name}: {grid.points[0].task.name}, {len(grid.seeds)} seeds")
+    of = ", ".join(dict.fromkeys(point.asked or point.task.name for point in grid.points))
+    plot.sweep(out / "sweep.png", summaries, f"{name}: {of}, {len(grid.seeds)} seeds")
     code = _exit_code(out)
     if code == DONE:
+        best = ", ".join(str(path) for path in sorted(out.glob("best*.json")))
         console.print(
             f"done in {clock(seconds)}: {out}/results.csv, summary.json, sweep.png;"
-            f" the best point again: make train CONFIG={out}/best.json OUT=…"
+            f" the best point again: make train CONFIG={best} OUT=…"
         )
     return code
 
 
 def _exit_code(out: Path) -> int:
-    if (out / "best.json").exists():
+    if any(out.glob("best*.json")):
         return DONE
     print_error(f"{out}: every member diverged; see results.csv")
     return FAILED
@@ -174,7 +265,7 @@ def _print_table(summaries: list[results.Summary], seeds: int) -> None:
     rows = [
         [*(grids.text(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
         + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
-        for f in results.ranked(summaries)[:SHOWN]
+        for f in results.ranked(summaries)[:SHOWN]  # of several tasks, task after task
     ]
     rows.insert(0, [*summaries[0]["at"], "return", "success", "diverged"])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]

@@ -19,10 +19,11 @@ from qrl_envs.uncertainty import Uncertainty
 DIGITS = 6  # significant digits of the values of a range
 # Columns of results.csv, and prefixes of others: no axis may have such a name.
 COLUMNS = (
-    *("point", "seed", "seeds", "diverged", "env_steps", "updates", "return_mean", "return_min", "success"),
+    *("point", "seed", "seeds", "diverged", "pruned", "env_steps", "updates", "return_mean", "return_min", "success"),
     *("train_seconds", "steps_per_second", "reward_mean", "ended_early", "apg_skipped", *UpdateMetrics._fields),
 )
 MEASURES = ("settle_", "rms_")
+PARTS = ("task", "vehicle", "uncertainty", "reference")  # settings that are whole tasks, or whole parts of one, by name
 EVALUATION = "task.evaluation"  # the same for all points, else they could not be compared
 
 
@@ -82,13 +83,13 @@ class Axis:
 
 
 def settable(task: TaskRecord) -> list[str]:
-    """Settings that a grid may name: hyperparameters, and paths into the task's record."""
+    """Settings that a grid may name: hyperparameters, parts of the task, and paths into its record."""
     spec = task.spec or {}
     paths = [path for path in _paths(spec, "task") if path != "task.description"]
     if "uncertainty" in spec:  # its record leaves out the ranges that came later and say nothing
         added = (f"task.uncertainty.{name}" for name in Uncertainty.model_fields)
         paths = list(dict.fromkeys((*paths, *added)))
-    return [*Config.model_fields, *(path for path in paths if not path.startswith(EVALUATION))]
+    return [*Config.model_fields, *PARTS, *(path for path in paths if not path.startswith(EVALUATION))]
 
 
 def _paths(value: Any, path: str) -> Iterable[str]:
@@ -112,7 +113,7 @@ def put(spec: Any, path: list[str], value: Any) -> Any:
     return {**spec, first: put(spec.get(first), rest, value)}
 
 
-def parse_axis(name: str, value: Any, known: list[str], where: str, *, sampled: bool) -> Axis:
+def parse_axis(name: str, value: Any, where: str, *, sampled: bool) -> Axis:
     """One axis as the grid file writes it: a list, a range, or an object of named settings."""
     key = f"{where}: key 'axes.{name}'"
     if value in ([], {}):
@@ -124,21 +125,23 @@ def parse_axis(name: str, value: Any, known: list[str], where: str, *, sampled: 
     if all(isinstance(inner, dict) for inner in value.values()):
         if not name or "" in value:
             raise BadInput(f'{key}: expected a name for {"each of its settings" if name else "the axis"}, found ""')
-        if name in (*known, *COLUMNS) or name.startswith(MEASURES):
+        if name in (*Config.model_fields, *PARTS, *COLUMNS) or name.startswith((*MEASURES, "task.")):
             raise BadInput(f"{key}: expected another name than that of a setting or a column of results.csv")
         return Axis(name, value)
     span = specfile.build(Range, value, f"{where}: axes.{name}")
     if (span.count is None) != sampled:
-        expected = "no count where points are sampled" if sampled else "a count, or else 'sample'"
+        expected = "no count where points are sampled" if sampled else "a count, or else 'sample' or 'search'"
         raise BadInput(f"{key}: expected {expected}, found {json.dumps(value)}")
+    if name in PARTS:
+        raise BadInput(f"{key}: expected a list of names or files, found {json.dumps(value)}")
     if span.count == 1:
         raise BadInput(f"{key}: expected a range of at least 2 values, found count 1")
     return Axis(name, span)
 
 
-def check_names(fixed: dict[str, Any], axes: list[Axis], known: list[str], where: str) -> None:
-    """BadInput if a setting is unknown, or set twice."""
-    setters: dict[str, str] = {}
+def check_names(task: str, fixed: dict[str, Any], axes: list[Axis], known: list[str], where: str) -> None:
+    """BadInput if a setting is unknown, or set twice; `task` is the grid's own, "" for none."""
+    setters: dict[str, str] = {"task": "task"} if task else {}
     for setter, names in [("fixed", list(fixed)), *((f"axes.{axis.name}", axis.names()) for axis in axes)]:
         for name in names:
             if name.startswith(EVALUATION):

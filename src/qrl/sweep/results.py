@@ -22,9 +22,19 @@ Summary = dict[str, Any]
 def table(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
     """A row for each point and seed: the point's coordinates, the seed, and its last report."""
     return [
-        {**_label(grid, index), "diverged": result.diverged, **result.rows[-1]}
+        {
+            **_label(grid, index),
+            "diverged": result.diverged,
+            **_pruned(grid, index // len(grid.seeds), [result]),
+            **result.rows[-1],
+        }
         for index, result in sorted(results.items())
     ]
+
+
+def _pruned(grid: Grid, point: int, results: list[Result]) -> dict[str, bool]:
+    """For a search, whether the point's training was ended early."""
+    return {"pruned": grid.pruned(point, results)} if grid.file.search else {}
 
 
 def curves(grid: Grid, results: dict[int, Result]) -> list[dict[str, Any]]:
@@ -57,7 +67,8 @@ def summaries(grid: Grid, results: dict[int, Result]) -> list[Summary]:
             if name not in ("env_steps", "updates")
         }
         num_diverged = sum(bool(seed.diverged) for seed in seeds)
-        found.append({"point": i, "at": point.coordinates, "seeds": len(seeds), "diverged": num_diverged, **numbers})
+        about = {"seeds": len(seeds), "diverged": num_diverged, **_pruned(grid, i, seeds)}
+        found.append({"point": i, "at": point.coordinates, **about, **numbers})
     return found
 
 
@@ -91,8 +102,8 @@ def best(found: list[Summary]) -> int | None:
 
 
 def _rank(summary: Summary) -> tuple[bool, float, float]:
-    alive = summary["diverged"] < summary["seeds"]
-    return alive, rank_key(summary["success"]["median"]), rank_key(summary["return_mean"]["median"])
+    whole = summary["diverged"] < summary["seeds"] and not summary.get("pruned")
+    return whole, rank_key(summary["success"]["median"]), rank_key(summary["return_mean"]["median"])
 
 
 def ranked(found: list[Summary]) -> list[Summary]:
@@ -114,11 +125,22 @@ def best_run_config(grid: Grid, results: dict[int, Result], point: int) -> RunCo
     )
 
 
+def by_task(grid: Grid, found: list[Summary]) -> dict[str, list[Summary]]:
+    """Results of each task: those of different tasks are not compared."""
+    tasks: dict[str, list[Summary]] = {}
+    for summary in found:
+        tasks.setdefault(grid.points[summary["point"]].asked, []).append(summary)
+    return tasks
+
+
 def write(out: Path, grid: Grid, results: dict[int, Result], found: list[Summary], seconds: float) -> None:
     files.replace_text(out / "results.csv", files.csv_text(table(grid, results)))
     files.replace_text(out / "curves.csv", files.csv_text(curves(grid, results)))
-    winner = best(found)
-    if winner is not None:
-        files.write_json(out / "best.json", best_run_config(grid, results, winner).model_dump(mode="json"))
-    summary = {"best": winner, "programs": len(grid.groups()), "points": found, "command_seconds": round(seconds, 1)}
+    of_tasks = {task: best(these) for task, these in by_task(grid, found).items()}
+    for winner in of_tasks.values():
+        name = "best.json" if len(of_tasks) == 1 else f"best-{winner}.json"
+        if winner is not None:
+            files.write_json(out / name, best_run_config(grid, results, winner).model_dump(mode="json"))
+    winners = of_tasks if len(of_tasks) > 1 else next(iter(of_tasks.values()))
+    summary = {"best": winners, "programs": len(grid.groups()), "points": found, "command_seconds": round(seconds, 1)}
     files.write_json(out / "summary.json", summary)

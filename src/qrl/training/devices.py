@@ -46,9 +46,13 @@ def configure_callbacks(environment: MutableMapping[str, str] = os.environ) -> N
     """Give XLA two threads at least: with one, a program that calls Python waits for ever for what it is to hand over,
     where that is 100 KB or more. To be called before JAX initializes its devices.
     """
-    given = next((environment[name] for name in THREADS if name in environment), str(_cores()))
-    if given == "1":
+    if threads(environment) == "1":
         environment["PJRT_NPROC"] = "2"
+
+
+def threads(environment: Mapping[str, str] = os.environ) -> str:
+    """XLA's number of threads in a process of this one's environment."""
+    return next((environment[name] for name in THREADS if name in environment), str(_cores()))
 
 
 def cpu_devices(learner: Config, seeds: int, cores: int) -> int:
