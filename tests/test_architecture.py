@@ -43,7 +43,8 @@ ROOMS: dict[str, dict[str, Room]] = {
         "tasks": Room({"runs", "algorithm", "config"}, MATHS | WORLDS | {"brax"}),
         "request": Room({"tasks", "training", "runs", "config"}, MATHS | WORLDS),
         "sweep": Room(
-            {"tasks", "training", "runs", "algorithm", "config"}, MATHS | WORLDS | {"pydantic", "matplotlib"}
+            {"tasks", "training", "runs", "algorithm", "config"},
+            MATHS | WORLDS | {"pydantic", "matplotlib", "optuna", "ray"},
         ),
         "evaluation": Room({"tasks", "training", "export", "runs", "algorithm", "config"}, MATHS | WORLDS),
         "identification": Room(set(), MATHS | WORLDS | {"scipy", "matplotlib"}),

@@ -49,6 +49,8 @@ NAMED = {"task": "hover", "axes": {"m": {"a": {}, "b": {"lam": 0.5}}, "task.vehi
 RANGE = {"from": 1e-3, "to": 0.5, "spacing": "log"}
 SPANNED = {"task": "circle", "axes": {"sigma": RANGE | {"count": 3}}, "seeds": [4, 7]}
 SAMPLED = {"task": "hover", "axes": {"sigma": RANGE, "lam": [0.5, 1]}, "sample": {"count": 5, "seed": 1}}
+PARTED = {"axes": {"task": ["hover", "circle"], "vehicle": ["crazyflie", "x500"]}, "fixed": {"gamma": 0.9}}
+SEARCHED = {"task": "hover", "axes": {"sigma": RANGE, "lam": [0.5, 1]}, "search": {"trials": 5, "prune": False}}
 FILE = specfile.build(grid.GridFile, LISTED, "")
 GRID = grid.Grid(FILE, [grid.GridPoint({"gamma": 0.9}, PENDULUM, LEARNER)])
 
@@ -175,7 +177,9 @@ KINDS = {
     "task": Kind("mine.json", reads_task, [*SHIPPED, tree(VEHICLE), tree({"extend": "circle"})]),
     "config": Kind("mine.json", reads_config, [tree(RUN.model_dump(mode="json")), tree(PART)]),
     "stored": Kind("config.json", reads_stored, [tree(RUN.model_dump(mode="json"))]),
-    "grid": Kind("mine.json", reads_grid, [tree(LISTED), tree(NAMED), tree(SPANNED), tree(SAMPLED)]),
+    "grid": Kind(
+        "mine.json", reads_grid, [tree(LISTED), tree(NAMED), tree(SPANNED), tree(SAMPLED), tree(PARTED), tree(SEARCHED)]
+    ),
     "chunk": Kind("0000000.json", reads_chunk, [tree(CHUNK)]),
     "held": Kind("grid.json", reads_held, [tree(RECORD)]),
     "metrics": Kind("metrics.csv", reads_metrics, [TABLE], OSError, spelled_csv),

@@ -21,32 +21,17 @@ from qrl.config import FORMER_NAMES
 from qrl.runs import files
 from qrl.sweep import plot, results, runner
 from qrl.sweep.grid import load
-from qrl.sweep.runner import Chunk, Local, Member, Progress, Result
+from qrl.sweep.runner import Local, Progress, Result
 from qrl.training import driver, sharding
 from qrl.training.state import TrainState, member_inputs, stack
 from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
+from sweep_helpers import Rows, chunk_of, rows_of, write_grid
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
 AXES = {"learning_rate": [1e-3, 1e-2, 1e30], "task.rod.mass_kg": [1.3, 1.0]}  # the last step size diverges
-Rows = list[dict[str, str]]
-
-
-def write_grid(folder: Path, axes: dict[str, Any], **more: Any) -> Path:
-    path = folder / "grid.json"
-    path.write_text(json.dumps({"task": "pendulum", "fixed": TINY_VALUES, "axes": axes, "seeds": [0, 3], **more}))
-    return path
-
-
-def rows_of(path: Path) -> Rows:
-    """A table without its clocks."""
-    with path.open() as file:
-        return [
-            {k: v for k, v in row.items() if not k.endswith(("_seconds", "_per_second"))}
-            for row in csv.DictReader(file)
-        ]
 
 
 def at(rows: Rows, **place: str) -> dict[str, str]:
@@ -251,6 +236,14 @@ def test_two_sweeps_do_not_work_in_one_folder(tmp_path: Path, capsys: pytest.Cap
     assert not (out / "grid.json").exists()
 
 
+def test_ray_is_asked_for_by_the_name_of_its_extra(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    said = complaint(capsys, "sweep", write_grid(tmp_path, {"gamma": [0.9]}), "--engine", "ray")
+    assert said == "qrl: --engine ray: needs Ray: pip install 'qrl[ray]'\n"
+
+
 def test_where_all_diverged_the_exit_code_is_1_each_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     grid, out = write_grid(tmp_path, {"learning_rate": [1e30]}), tmp_path / "out"
     for _ in range(2):
@@ -290,13 +283,6 @@ def test_a_sweep_of_the_first_version_is_refused(
     said = complaint(capsys, "sweep", done.parent / "grid.json", "--out", tmp_path / "out")
     assert "by another version of qrl" in said
     assert str(tmp_path / "out" / "grid.json") in said
-
-
-def chunk_of(grid: Any, seeds: int) -> Chunk:
-    """The first point of a grid, with its first seeds."""
-    point, inputs = grid.points[0], member_inputs(worlds.make("pendulum"), grid.points[0].learner)
-    members = [Member(i, i, inputs) for i in range(seeds)]
-    return Chunk(point.task, point.learner, point.static, members, seeds, 0, 1)
 
 
 def test_a_fault_in_a_chunk_is_no_end_of_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

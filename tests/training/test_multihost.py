@@ -14,6 +14,8 @@ import fault_injection
 from fault_injection import STRESS
 from qrl.runs import checkpoint
 from qrl.runs.integrity import FORMAT, MANIFEST
+from qrl.training import multihost
+from qrl_envs.specfile import BadInput
 
 SURVIVOR_SECONDS = 60.0  # in which the other has to end
 STEPS = 32_000
@@ -109,3 +111,41 @@ def test_wrong_input_is_told_once(tmp_path: Path) -> None:
     assert "unknown task 'hoverr' (did you mean 'hover'?)" in fault_injection.complaint(first, 2)
     assert (second.code, second.error) == (2, "")
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "env", "expected"),
+    [
+        ((None, None, None), {}, (0, 1, "")),
+        ((1, 4, "host:1"), {}, (1, 4, "host:1")),
+        (
+            (None, None, None),
+            {"JAX_PROCESS_ID": "2", "JAX_NUM_PROCESSES": "3", "JAX_COORDINATOR_ADDRESS": "h:1"},
+            (2, 3, "h:1"),
+        ),
+        (
+            (0, None, None),
+            {"JAX_PROCESS_ID": "2", "JAX_NUM_PROCESSES": "3", "JAX_COORDINATOR_ADDRESS": "h:1"},
+            (0, 3, "h:1"),
+        ),
+        ((None, None, None), {"SLURM_PROCID": "1", "SLURM_STEP_NUM_TASKS": "2", "SLURM_NTASKS": "2"}, (1, 2, "")),
+        ((None, None, None), {"SLURM_PROCID": "0", "SLURM_NTASKS": "2"}, (0, 1, "")),  # a batch script, without srun
+    ],
+)
+def test_a_process_knows_which_it_is(flags: tuple, env: dict, expected: tuple) -> None:
+    assert multihost.this_process(*flags, env) == expected
+
+
+@pytest.mark.parametrize(
+    ("flags", "env", "words"),
+    [
+        ((2, 2, "h:1"), {}, "--process-id below --processes, found 2 of 2"),
+        ((1, None, "h:1"), {}, "--process-id below --processes"),
+        ((0, 2, None), {}, "--coordinator is missing"),
+        ((None, None, "h:1"), {}, "--processes is missing"),
+        ((None, None, None), {"JAX_PROCESS_ID": "one"}, "--process-id: expected a number, found 'one'"),
+    ],
+)
+def test_a_process_that_cannot_know_is_refused(flags: tuple, env: dict, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        multihost.this_process(*flags, env)

@@ -81,6 +81,18 @@ def _holds_sweep(out: Path, grid: Grid) -> bool:
     return True
 
 
+class Program(NamedTuple):
+    """A compiled program: a point that it is made from, its number, and the bytes of each member."""
+
+    point: GridPoint
+    number: int
+    member_bytes: int
+
+    def chunk(self, members: list[Member], size: int) -> Chunk:
+        at, room = self.point, runner.chunk_bytes(size, self.member_bytes)
+        return Chunk(at.task, at.learner, at.static, members, size, self.number, room)
+
+
 class Plan:
     """What a sweep has to train: all points of a grid, or a search's, batch by batch."""
 
@@ -184,18 +196,6 @@ class Plan:
         return self._programs[point.static]
 
 
-class Program(NamedTuple):
-    """A compiled program: a point that it is made from, its number, and the bytes of each member."""
-
-    point: GridPoint
-    number: int
-    member_bytes: int
-
-    def chunk(self, members: list[Member], size: int) -> Chunk:
-        at, room = self.point, runner.chunk_bytes(size, self.member_bytes)
-        return Chunk(at.task, at.learner, at.static, members, size, self.number, room)
-
-
 def _train(plan: Plan, engine: runner.Engine, folder: Path, stopped: Callable[[], bool]) -> dict[int, Result] | None:
     """Train batch by batch with progress on the screen: a line for each chunk, and a bar. None if stopped before."""
     found = runner.finished(
@@ -240,7 +240,7 @@ def _train(plan: Plan, engine: runner.Engine, folder: Path, stopped: Callable[[]
 def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
     summaries = results.summaries(grid, found)
     results.write(out, grid, found, summaries, seconds)
-    _print_table(summaries, len(grid.seeds))
+    _print_table(grid, summaries)
     of = ", ".join(dict.fromkeys(point.asked or point.task.name for point in grid.points))
     plot.sweep(out / "sweep.png", summaries, f"{name}: {of}, {len(grid.seeds)} seeds")
     code = _exit_code(out)
@@ -260,14 +260,17 @@ def _exit_code(out: Path) -> int:
     return FAILED
 
 
-def _print_table(summaries: list[results.Summary], seeds: int) -> None:
-    """The best points, best first: median and quartiles over seeds."""
+def _print_table(grid: Grid, summaries: list[results.Summary]) -> None:
+    """The best points, best first, of several tasks task after task: median and quartiles over seeds."""
+    ranked = [summary for these in results.by_task(grid, summaries).values() for summary in results.ranked(these)]
     rows = [
         [*(grids.text(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
-        + [f"{f['diverged']} of {seeds}" if f["diverged"] else ""]
-        for f in results.ranked(summaries)[:SHOWN]  # of several tasks, task after task
+        + [f"{f['diverged']} of {f['seeds']}" if f["diverged"] else ""]
+        + ["yes" if f["pruned"] else ""] * ("pruned" in f)
+        for f in ranked[:SHOWN]
     ]
-    rows.insert(0, [*summaries[0]["at"], "return", "success", "diverged"])
+    search = ["pruned"] if grid.file.search else []
+    rows.insert(0, [*summaries[0]["at"], "return", "success", "diverged", *search])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:
         console.print("  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)).rstrip())

@@ -80,8 +80,8 @@ class Ray:
         if found and all(resources.get("memory", 0) < need for resources in found):
             most = max(resources.get("memory", 0) for resources in found)
             raise BadInput(
-                f"--memory-gb: expected tasks that a node of the cluster has memory for, found {need / 1e9:.2g} GB"
-                f" for a task ({PROCESS_BYTES / 1e9:g} of them for its process) and at most {most / 1e9:.2g} GB of a node"
+                f"--memory-gb: expected tasks that a node of the cluster has memory for, found {need / 1e9:.2g} GB for"
+                f" a task ({PROCESS_BYTES / 1e9:g} of them for its process) and at most {most / 1e9:.2g} GB of a node"
             )
 
 

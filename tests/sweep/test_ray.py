@@ -1,0 +1,143 @@
+"""A sweep on a cluster: a node is killed in the middle, nothing is lost, and the results are those of one machine."""
+
+import importlib.util
+import os
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import pytest
+
+from cli_helpers import TINY_VALUES, complaint, qrl
+from qrl.runs import record
+from qrl.sweep import runner
+from qrl.sweep.grid import load
+from qrl_envs.specfile import BadInput
+from sweep_helpers import chunk_of, rows_of, write_grid
+
+# CI has it: a test that is skipped for want of a tool is a failure there.
+if not importlib.util.find_spec("ray") and not os.environ.get("QRL_REQUIRE_CROSS"):
+    pytest.skip("Ray is not installed: pip install 'qrl[ray]'", allow_module_level=True)
+
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
+STORE_BYTES = 80_000_000
+AXES = {"learning_rate": [1e-3, 1e-2], "task.rod.mass_kg": [1.3, 1.0]}
+FIXED = {**TINY_VALUES, "num_timesteps": 20_000}
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[Any]:
+    """A cluster of two nodes, of one core each: the head, and one to kill."""
+    from ray.cluster_utils import Cluster
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        node = {"num_cpus": 1, "object_store_memory": STORE_BYTES, "memory": 4_000_000_000}
+        cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
+        try:
+            victim = cluster.add_node(**node)
+            patch.setenv("RAY_ADDRESS", cluster.address)
+            yield cluster, victim
+        finally:
+            cluster.shutdown()
+
+
+def trains(raylet: int) -> bool:
+    """Whether a worker process of this node is at a task: Ray writes its name into the process's title."""
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            parent = int(status.read_text().rpartition(")")[2].split()[1])
+            if parent == raylet and b"_train" in (status.parent / "cmdline").read_bytes():
+                return True
+        except OSError:  # gone meanwhile
+            continue
+    return False
+
+
+def test_a_node_killed_in_mid_sweep_costs_nothing(
+    nodes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Every member has its result, equal to the bit to that of the local engine. What was recorded stays as it is."""
+    cluster, victim = nodes
+    monkeypatch.setattr(runner, "CPU_CHUNK", 1)
+    grid, here, out = write_grid(tmp_path, AXES, fixed=FIXED), tmp_path / "local", tmp_path / "ray"
+    assert qrl("sweep", grid, "--out", here) == 0
+    (out / "chunks").mkdir(parents=True)
+    for path in [here / "grid.json", here / "chunks" / "0000003.json"]:  # an interrupted sweep's
+        (out / path.relative_to(here)).write_bytes(path.read_bytes())
+    os.utime(out / "chunks" / "0000003.json", (1, 1))
+    killed_at: list[int] = []
+
+    def kill() -> None:
+        until = time.monotonic() + 200
+        raylet = victim.all_processes["raylet"][0].process.pid
+        while time.monotonic() < until:
+            recorded = len(list((out / "chunks").glob("*.json")))
+            if recorded > 1 and trains(raylet):
+                cluster.remove_node(victim, allow_graceful=False)
+                killed_at.append(recorded)
+                return
+            time.sleep(0.02)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    capsys.readouterr()
+    assert qrl("sweep", grid, "--out", out, "--engine", "ray") == 0
+    killer.join()
+    assert killed_at
+    assert killed_at[0] < 8
+    assert "Ray, 2 CPUs of 2 nodes" in capsys.readouterr().out
+    for table in ("results.csv", "curves.csv"):
+        assert rows_of(out / table) == rows_of(here / table)
+    assert (out / "best.json").read_text() == (here / "best.json").read_text()
+    assert (out / "chunks" / "0000003.json").stat().st_mtime == 1
+    assert sorted(runner.finished(out / "chunks")) == list(range(8))
+
+
+def test_a_task_too_large_for_every_node_is_refused(
+    nodes: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Ray would wait for a node that has room, without a word."""
+    fixed = {name: value for name, value in FIXED.items() if name != "replay_unrolls"}
+    grid = write_grid(tmp_path, {"gamma": [0.9], "replay_unrolls": [1_000_000]}, fixed=fixed, seeds=1)
+    said = complaint(capsys, "sweep", grid, "--out", tmp_path / "out", "--engine", "ray", "--memory-gb", "50")
+    assert "--memory-gb: expected tasks that a node of the cluster has memory for" in said
+    assert "at most 4 GB of a node" in said
+
+
+def test_a_node_of_other_versions_is_refused(tmp_path: Path) -> None:
+    """Its bits would be others."""
+    from qrl.sweep import ray_engine
+
+    chunk = chunk_of(load(write_grid(tmp_path, {"gamma": [0.9]}), 1e9), 1)
+    versions = record.versions() | {"jax": "0.1"}
+    with pytest.raises(BadInput, match=rf"expected the versions of the sweep, found jax {jax.__version__} for 0.1$"):
+        ray_engine._train(chunk, versions)
+
+
+@pytest.mark.parametrize(
+    ("address", "code", "words"),
+    [
+        ("127.0.0.1:1", 1, "RAY_ADDRESS=127.0.0.1:1: no Ray cluster can be reached there"),
+        ("somewhere", 2, "RAY_ADDRESS=somewhere: Invalid address"),
+    ],
+)
+def test_a_cluster_that_is_not_there_is_said_in_a_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    address: str,
+    code: int,
+    words: str,
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    grid = write_grid(tmp_path, {"gamma": [0.9]})
+    assert qrl("sweep", grid, "--out", tmp_path / "out", "--engine", "ray") == code
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "out").exists()
