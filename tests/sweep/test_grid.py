@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from qrl import tasks
+from qrl import request, tasks
 from qrl.config import Config, Hyperparameters, load_preset
-from qrl.sweep import grid
+from qrl.runs.record import ConfigFile
+from qrl.sweep import grid, results
 from qrl.sweep.axes import Axis
+from qrl.sweep.runner import Result
 from qrl_envs.specfile import BadInput
 
 GRIDS = Path(__file__).resolve().parents[2] / "experiments" / "grids"
@@ -173,8 +175,97 @@ def test_a_task_that_is_judged_as_it_trains_cannot_change_that(tmp_path: Path) -
     load(tmp_path, {"task": "pendulum", "axes": {"episode_length": [100, 200]}})
 
 
+def test_whole_tasks_and_vehicles_are_axes(tmp_path: Path) -> None:
+    """Each point is the run that `qrl train TASK --vehicle VEHICLE` is, and has a program of its own."""
+    axes = {"task": ["hover", "circle"], "vehicle": ["crazyflie", "x500"], "gamma": [0.97, 0.98]}
+    found = load(tmp_path, {"axes": axes, "fixed": {"uncertainty": "none"}})
+    assert [list(point.coordinates.values()) for point in found.points] == [
+        list(v) for v in itertools.product(*axes.values())
+    ]
+    assert [len(group) for group in found.groups()] == [2] * 4
+    for point in found.points:
+        at = point.coordinates
+        parts = {"vehicle": at["vehicle"], "uncertainty": "none"}
+        run = request.run_config(at["task"], None, ConfigFile(), {"gamma": at["gamma"]}, None, None, parts)
+        assert (point.task, point.learner) == (run.task, run.learner)
+
+
+def test_named_settings_may_hold_a_task(tmp_path: Path) -> None:
+    """And values of what another has not."""
+    cases = {"rod": {"task": "pendulum", "task.rod.mass_kg": 2.0}, "x500": {"task": "hover", "vehicle": "x500"}}
+    rod, x500 = load(tmp_path, {"axes": {"case": cases}}).points
+    assert spec(rod)["rod"]["mass_kg"] == 2.0
+    assert spec(x500)["vehicle"]["motors"] == tasks.task_record("hover", {"vehicle": "x500"}).spec["vehicle"]["motors"]
+
+
+def test_points_of_one_task_alone_are_compared(tmp_path: Path) -> None:
+    """Of each of two tasks there is a best, and a file that repeats it."""
+    axes = {"task": ["hover", "circle"], "gamma": [0.8, 0.9]}
+    found = load(tmp_path, {"axes": axes, "seeds": 1})
+    ends = {
+        i: Result([{"env_steps": 1, "updates": 1, "return_mean": x, "return_min": x, "success": 0.5}], "")
+        for i, x in enumerate((-1.0, -2.0, -400.0, -300.0))
+    }
+    results.write(tmp_path, found, ends, results.summaries(found, ends), 1.0)
+    assert json.loads((tmp_path / "summary.json").read_text())["best"] == {"hover": 0, "circle": 3}
+    for point, name in ((0, "hover"), (3, "circle")):
+        best = json.loads((tmp_path / f"best-{point}.json").read_text())
+        assert (best["task"]["name"], best["learner"]["gamma"]) == (name, found.points[point].learner.gamma)
+
+
 GAMMA = {"gamma": [0.9, 0.99]}
 WRONG: dict[str, tuple[dict, str]] = {
+    "unknown vehicle": (
+        {"task": "hover", "axes": {"vehicle": ["x500", "x50"]}},
+        r"at vehicle x50: .*'x50' \(did you mean 'x500'\?\)",
+    ),
+    "a vehicle for a rod": ({"axes": {"vehicle": ["x500"]}}, r"at vehicle x500: "),
+    "a task twice": ({"axes": {"task": ["hover"]}}, r"key 'axes.task': 'task' is set in 'task' too"),
+    "the same task twice": (
+        {"task": "", "axes": {"task": ["hover", "hover"]}},
+        r"each point once, found task hover and task hover",
+    ),
+    "a number for a vehicle": (
+        {"task": "hover", "axes": {"vehicle": [5]}},
+        r"at vehicle 5: expected a name or a file, found 5",
+    ),
+    "a range of vehicles": (
+        {"axes": {"vehicle": {"from": 1, "to": 2, "count": 2}}},
+        r"key 'axes.vehicle': expected a list of names or files",
+    ),
+    "no task anywhere": ({"task": "", "axes": GAMMA}, r"key 'task' is missing"),
+    "a path that a task lacks": (
+        {"task": "", "axes": {"task": ["hover", "pendulum"], "task.rod.mass_kg": [1.0]}},
+        r"at task hover, task.rod.mass_kg 1.0: key 'task.rod.mass_kg': task 'hover' has none",
+    ),
+    "vehicles judged otherwise": (
+        {"task": "hover", "axes": {"v": {"a": {}, "b": {"vehicle": "x500", "num_eval_envs": 7}}}},
+        r"evaluated alike, found another number of flights",
+    ),
+    "a search and a sample": (
+        {"axes": {"gamma": [0.5, 0.9]}, "sample": {"count": 1}, "search": {"trials": 1}},
+        r"expected 'sample' or 'search', found both",
+    ),
+    "a search with count": (
+        {"axes": {"gamma": {"from": 0.5, "to": 0.9, "count": 3}}, "search": {"trials": 2}},
+        r"expected no count where points are sampled",
+    ),
+    "more trials than points": (
+        {"axes": {"gamma": [0.5, 0.9]}, "search": {"trials": 3}},
+        r"key 'search.trials': expected no more trials than the axes hold points, found 3; they hold 2",
+    ),
+    "a search over tasks": (
+        {"task": "", "axes": {"task": ["hover", "circle"]}, "search": {"trials": 2}},
+        r"expected one task for a search",
+    ),
+    "a search over fractions of a count": (
+        {"axes": {"num_envs": {"from": 8, "to": 16}}, "search": {"trials": 2}},
+        r"at num_envs 11.056: key 'num_envs'",
+    ),
+    "a measure that is none": (
+        {"axes": GAMMA, "search": {"trials": 1, "maximize": "speed"}},
+        r"key 'search.maximize'",
+    ),
     "misspelt axis": ({"axes": {"gama": [0.9]}}, r"axes.gama: unknown key 'gama' \(did you mean 'gamma'\?\)"),
     "misspelt path": (
         {"axes": {"task.rod.mas_kg": [1.0]}},

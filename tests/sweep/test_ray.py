@@ -2,11 +2,13 @@
 
 import importlib.util
 import os
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from subprocess import PIPE
 
 import jax
 import pytest
@@ -22,28 +24,46 @@ from sweep_helpers import chunk_of, rows_of, write_grid
 if not importlib.util.find_spec("ray") and not os.environ.get("QRL_REQUIRE_CROSS"):
     pytest.skip("Ray is not installed: pip install 'qrl[ray]'", allow_module_level=True)
 
+import ray_nodes
+
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
-STORE_BYTES = 80_000_000
 AXES = {"learning_rate": [1e-3, 1e-2], "task.rod.mass_kg": [1.3, 1.0]}
 FIXED = {**TINY_VALUES, "num_timesteps": 20_000}
 
 
-@pytest.fixture(scope="module")
-def nodes() -> Iterator[Any]:
-    """A cluster of two nodes, of one core each: the head, and one to kill."""
-    from ray.cluster_utils import Cluster
+class Nodes:
+    """The cluster of ray_nodes.py; it starts while others work."""
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-        node = {"num_cpus": 1, "object_store_memory": STORE_BYTES, "memory": 4_000_000_000}
-        cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
-        try:
-            victim = cluster.add_node(**node)
-            patch.setenv("RAY_ADDRESS", cluster.address)
-            yield cluster, victim
-        finally:
-            cluster.shutdown()
+    def __init__(self) -> None:
+        command = [sys.executable, ray_nodes.__file__]
+        self.process = subprocess.Popen(command, stdin=PIPE, stdout=PIPE, stderr=subprocess.DEVNULL, text=True)
+        self._address = ""
+
+    @property
+    def address(self) -> str:
+        if not self._address:
+            line = self._said("cluster ")
+            _, self._address, raylet = line.split()
+            self.raylet = int(raylet)
+        return self._address
+
+    def kill_second(self) -> None:
+        self.process.stdin.write("kill\n")
+        self.process.stdin.flush()
+        self._said("killed")
+
+    def _said(self, begin: str) -> str:
+        return next(line for line in self.process.stdout if line.startswith(begin))
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[Nodes]:
+    found = Nodes()
+    try:
+        yield found
+    finally:
+        found.process.communicate(timeout=60)  # closes its input
 
 
 def trains(raylet: int) -> bool:
@@ -59,10 +79,9 @@ def trains(raylet: int) -> bool:
 
 
 def test_a_node_killed_in_mid_sweep_costs_nothing(
-    nodes: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    nodes: Nodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Every member has its result, equal to the bit to that of the local engine. What was recorded stays as it is."""
-    cluster, victim = nodes
     monkeypatch.setattr(runner, "CPU_CHUNK", 1)
     grid, here, out = write_grid(tmp_path, AXES, fixed=FIXED), tmp_path / "local", tmp_path / "ray"
     assert qrl("sweep", grid, "--out", here) == 0
@@ -70,15 +89,15 @@ def test_a_node_killed_in_mid_sweep_costs_nothing(
     for path in [here / "grid.json", here / "chunks" / "0000003.json"]:  # an interrupted sweep's
         (out / path.relative_to(here)).write_bytes(path.read_bytes())
     os.utime(out / "chunks" / "0000003.json", (1, 1))
+    monkeypatch.setenv("RAY_ADDRESS", nodes.address)
     killed_at: list[int] = []
 
     def kill() -> None:
         until = time.monotonic() + 200
-        raylet = victim.all_processes["raylet"][0].process.pid
         while time.monotonic() < until:
             recorded = len(list((out / "chunks").glob("*.json")))
-            if recorded > 1 and trains(raylet):
-                cluster.remove_node(victim, allow_graceful=False)
+            if recorded > 1 and trains(nodes.raylet):
+                nodes.kill_second()
                 killed_at.append(recorded)
                 return
             time.sleep(0.02)
@@ -99,9 +118,10 @@ def test_a_node_killed_in_mid_sweep_costs_nothing(
 
 
 def test_a_task_too_large_for_every_node_is_refused(
-    nodes: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    nodes: Nodes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Ray would wait for a node that has room, without a word."""
+    monkeypatch.setenv("RAY_ADDRESS", nodes.address)
     fixed = {name: value for name, value in FIXED.items() if name != "replay_unrolls"}
     grid = write_grid(tmp_path, {"gamma": [0.9], "replay_unrolls": [1_000_000]}, fixed=fixed, seeds=1)
     said = complaint(capsys, "sweep", grid, "--out", tmp_path / "out", "--engine", "ray", "--memory-gb", "50")

@@ -15,7 +15,7 @@ from qrl.config import Config, load_preset
 from qrl.runs.record import ConfigFile, RunConfig
 from qrl.training import devices as processes
 
-CORES = processes._cores()
+CORES = processes.cores()
 LITTLE = {"batch_size": 8}  # 400 samples of 64 units
 
 
@@ -78,7 +78,7 @@ def test_what_is_said_stays(said: dict, added: dict) -> None:
 )
 def test_one_thread_for_little_work(changes: dict, environment: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     """Where it cannot be parted, and nothing is said of what would gain by more."""
-    monkeypatch.setattr(processes, "_cores", lambda: 2)
+    monkeypatch.setattr(processes, "cores", lambda: 2)
     said: dict[str, str] = {}
     processes.configure_cpu(run(**changes), [], said)
     assert said == environment
@@ -119,7 +119,7 @@ def test_a_run_that_goes_on_asks_for_the_devices_that_it_had(
 ) -> None:
     """Where they were of a CPU."""
     asked = []
-    monkeypatch.setattr(processes, "_cores", lambda: 2)
+    monkeypatch.setattr(processes, "cores", lambda: 2)
     monkeypatch.setattr(processes.jax.config, "update", lambda _, count: asked.append(count))
     processes.configure_cpu(run(**changes), before, {})
     assert asked == devices
@@ -186,6 +186,6 @@ def test_a_seed_of_several_is_repeated_as_it_was_trained() -> None:
 def test_a_program_that_calls_python_has_two_threads(
     environment: dict, cores: int, threads: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "_cores", lambda: cores)
+    monkeypatch.setattr(processes, "cores", lambda: cores)
     processes.configure_callbacks(environment)
     assert environment.get("PJRT_NPROC") == threads

@@ -34,36 +34,36 @@ def sweep(args: argparse.Namespace) -> int:
         if not importlib.util.find_spec("ray"):
             raise BadInput("--engine ray: needs Ray: pip install 'qrl[ray]'")
         jax.config.update("jax_platforms", "cpu")  # the accelerators are for the cluster's tasks
-    grid = grids.load(args.grid, devices.host_bytes() if args.engine == "ray" or not given else given)
-    out: Path = args.out or Path("runs") / args.grid.stem
-    if _holds_sweep(out, grid) and (out / "summary.json").exists() and (out / "sweep.png").exists():
-        console.print(f"{out}: complete already; nothing to do")
-        return _exit_code(out)
-    engine = _engine(args.engine, given)
+        from qrl.sweep.ray_engine import Ray
+
+        engine = Ray(given)  # first of all: it may fork, which a process that has JAX's threads must not
+    else:
+        engine = runner.Local(given)
     try:
-        plan = Plan(grid, engine, args.grid)
-        out.mkdir(parents=True, exist_ok=True)
-        with files.locked(out / "sweep.lock", f"{out}: in use by another sweep; wait for its end, or give another OUT"):
-            if not _holds_sweep(out, grid):
-                here = {"versions": record.versions(), "devices": devices.device_names()}
-                files.write_json(out / "grid.json", {**grid.record, **here})
-            console.print(f"{plan.describe()}, {engine.describe()} -> {out}")
-            with stop_requested("stopping: finished chunks are kept") as stopped:
-                found = _train(plan, engine, out / "chunks", stopped)
-            if found is None:
-                console.print("stopped; rerun the same command to resume")
-                return FAILED
-            return _finish(out, plan.grid, found, args.grid.stem, time.perf_counter() - start_time)
+        return _sweep(args, engine, start_time)
     finally:
         engine.close()
 
 
-def _engine(name: str, memory_bytes: float | None) -> runner.Engine:
-    if name == "local":
-        return runner.Local(memory_bytes or devices.memory_bytes())
-    from qrl.sweep.ray_engine import Ray
-
-    return Ray(memory_bytes)
+def _sweep(args: argparse.Namespace, engine: runner.Engine, start_time: float) -> int:
+    grid = grids.load(args.grid, engine.grid_bytes)
+    out: Path = args.out or Path("runs") / args.grid.stem
+    if _holds_sweep(out, grid) and (out / "summary.json").exists() and (out / "sweep.png").exists():
+        console.print(f"{out}: complete already; nothing to do")
+        return _exit_code(out)
+    plan = Plan(grid, engine, args.grid)
+    out.mkdir(parents=True, exist_ok=True)
+    with files.locked(out / "sweep.lock", f"{out}: in use by another sweep; wait for its end, or give another OUT"):
+        if not _holds_sweep(out, grid):
+            here = {"versions": record.versions(), "devices": devices.device_names()}
+            files.write_json(out / "grid.json", {**grid.record, **here})
+        console.print(f"{plan.describe()}, {engine.describe()} -> {out}")
+        with stop_requested("stopping: finished chunks are kept") as stopped:
+            found = _train(plan, engine, out / "chunks", stopped)
+        if found is None:
+            console.print("stopped; rerun the same command to resume")
+            return FAILED
+        return _finish(out, plan.grid, found, args.grid.stem, time.perf_counter() - start_time)
 
 
 def _holds_sweep(out: Path, grid: Grid) -> bool:
@@ -263,13 +263,13 @@ def _exit_code(out: Path) -> int:
 def _print_table(grid: Grid, summaries: list[results.Summary]) -> None:
     """The best points, best first, of several tasks task after task: median and quartiles over seeds."""
     ranked = [summary for these in results.by_task(grid, summaries).values() for summary in results.ranked(these)]
+    search = ["pruned"] if grid.file.search else []
     rows = [
         [*(grids.text(v) for v in f["at"].values()), _spread(f["return_mean"], ".2f"), _spread(f["success"], ".3f")]
         + [f"{f['diverged']} of {f['seeds']}" if f["diverged"] else ""]
-        + ["yes" if f["pruned"] else ""] * ("pruned" in f)
+        + ["yes" if f.get("pruned") else ""] * len(search)
         for f in ranked[:SHOWN]
     ]
-    search = ["pruned"] if grid.file.search else []
     rows.insert(0, [*summaries[0]["at"], "return", "success", "diverged", *search])
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for row in rows:

@@ -39,6 +39,7 @@ class Ray:
         self.on_cpu = not found.get("GPU") or os.environ.get("JAX_PLATFORMS") == "cpu"
         self._unit = "CPU" if self.on_cpu else "GPU"
         self.workers = max(1, int(found.get(self._unit, 0)))
+        self.grid_bytes = devices.host_bytes()
         self.memory_bytes = (task_bytes or TASK_BYTES[self._unit]) * self.workers
         self._nodes = sum(node["Alive"] for node in ray.nodes())
 
@@ -101,7 +102,7 @@ def _connect() -> None:
             ray.init("auto", **quietly)
             return
         os.environ.pop("RAY_ADDRESS", None)
-        cores = len(devices.workers())
+        cores = devices.cores()
         ray.init("local", num_cpus=cores, object_store_memory=OBJECT_STORE_BYTES, include_dashboard=False, **quietly)
     except ValueError as error:
         raise BadInput(f"RAY_ADDRESS={address}: {error}") from None

@@ -103,6 +103,7 @@ class Engine(Protocol):
     on_cpu: bool
     workers: int  # chunks at a time
     memory_bytes: float  # of the members of all workers
+    grid_bytes: float  # of points and reports, in this process
 
     def run(self, chunks: Sequence[Chunk], folder: Path, stopped: Callable[[], bool]) -> Iterator[Event]:
         """Train the chunks, and record each in `folder` once it is complete, until `stopped()`."""
@@ -148,11 +149,12 @@ def chunk_members(members: int, each_bytes: int, budget_bytes: float, workers: i
 class Local:
     """This machine: a thread for each core, or each accelerator."""
 
-    def __init__(self, memory_bytes: float) -> None:
+    def __init__(self, memory_bytes: float | None) -> None:
         self.devices = devices.workers()
         self.workers = len(self.devices)
         self.on_cpu = self.devices[0].platform == "cpu"
-        self.memory_bytes = memory_bytes
+        self.memory_bytes = memory_bytes or devices.memory_bytes()
+        self.grid_bytes = memory_bytes or devices.host_bytes()
 
     def describe(self) -> str:
         return f"{self.workers:,} worker{'s' * (self.workers != 1)} on {self.devices[0].platform.upper()}"

@@ -30,9 +30,9 @@ def configure_cpu(run: RunConfig, before: Sequence[str], environment: MutableMap
     """
     if any(name in environment for name in THREADS):
         return
-    count = cpu_devices(run.learner, run.seeds, _cores())
+    count = cpu_devices(run.learner, run.seeds, cores())
     if before and all("cpu" in name.lower() for name in before):
-        count = min(len(before), _cores())
+        count = min(len(before), cores())
     if requested := _requested_devices(environment):
         count = requested
     elif count > 1:
@@ -52,7 +52,7 @@ def configure_callbacks(environment: MutableMapping[str, str] = os.environ) -> N
 
 def threads(environment: Mapping[str, str] = os.environ) -> str:
     """XLA's number of threads in a process of this one's environment."""
-    return next((environment[name] for name in THREADS if name in environment), str(_cores()))
+    return next((environment[name] for name in THREADS if name in environment), str(cores()))
 
 
 def cpu_devices(learner: Config, seeds: int, cores: int) -> int:
@@ -85,10 +85,10 @@ def workers() -> list[Any]:
     and its bits are those of a single run on one device with as many threads.
     """
     devices = jax.local_devices()
-    return devices if devices[0].platform != "cpu" else devices[:1] * _cores()
+    return devices if devices[0].platform != "cpu" else devices[:1] * cores()
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that this process may use; a scheduler may restrict them."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
