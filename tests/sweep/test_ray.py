@@ -102,7 +102,7 @@ def test_a_node_killed_in_mid_sweep_costs_nothing(
                 return
             time.sleep(0.02)
 
-    killer = threading.Thread(target=kill)
+    killer = threading.Thread(target=kill, daemon=True)
     killer.start()
     capsys.readouterr()
     assert qrl("sweep", grid, "--out", out, "--engine", "ray") == 0

@@ -54,16 +54,15 @@ class Ray:
         """Results as they come. Where it is stopped, chunks that are under way are lost."""
         needs = [PROCESS_BYTES + (chunk.memory_bytes if self.on_cpu else 0) for chunk in chunks]
         self._check_memory(max(needs, default=0))
-        task = ray.remote(_train).options(
-            num_cpus=1,
-            num_gpus=0 if self.on_cpu else 1,
-            max_retries=RETRIES,
-            runtime_env={"env_vars": _variables(self.on_cpu)},
-        )
-        versions = record.versions()
-        waiting = []
+        place: dict[str, Any] = {"num_cpus": 1, "num_gpus": 0 if self.on_cpu else 1, "max_retries": RETRIES}
+        place |= {"runtime_env": {"env_vars": _variables(self.on_cpu)}}
+        task, versions = ray.remote(_train), record.versions()
+        waiting: list[Any] = []
         if not stopped():
-            waiting = [task.options(memory=n).remote(c, versions) for c, n in zip(chunks, needs, strict=True)]
+            waiting = [
+                task.options(memory=need, **place).remote(chunk, versions)
+                for chunk, need in zip(chunks, needs, strict=True)
+            ]
         try:
             while waiting and not stopped():
                 ready, waiting = ray.wait(waiting, timeout=POLL_SECONDS)
@@ -89,6 +88,9 @@ class Ray:
 def _connect() -> None:
     """OSError if there is no cluster at RAY_ADDRESS, BadInput if that is no address."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault(
+        "RAY_worker_niceness", "0"
+    )  # of a cluster that is started here; 15 would starve beside others
     quietly: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
     address = os.environ.get("RAY_ADDRESS", "")
     host, _, port = address.rpartition(":")
@@ -116,7 +118,7 @@ def _variables(on_cpu: bool) -> dict[str, str]:
     """
     passed = {name: value for name, value in os.environ.items() if name.startswith(PASSED_ON)}
     cache = {
-        "JAX_COMPILATION_CACHE_DIR": str(jax.config.read("jax_compilation_cache_dir") or ""),
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.values["jax_compilation_cache_dir"] or ""),
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
