@@ -100,7 +100,7 @@ def test_a_node_killed_in_mid_sweep_costs_nothing(
                 nodes.kill_second()
                 killed_at.append(recorded)
                 return
-            time.sleep(0.02)
+            time.sleep(0.1)
 
     killer = threading.Thread(target=kill, daemon=True)
     killer.start()
