@@ -34,7 +34,7 @@ define HELP
        REFERENCE=eight                 what to follow; RUN=any: which run; ARGS="--starts 1000 --off-nominal"
   make sweep GRID=experiments/grids/pendulum_lr.json   train every point of a grid; rerun to resume
        OUT=runs/pendulum_lr            the folder of its results
-       ARGS="--memory-gb 4"            any other flag of `qrl sweep`
+       ARGS="--engine ray"             on a Ray cluster; any other flag of `qrl sweep`
   make seeds TASK=circle             train 100 seeds, a core each: how many fly, how soon, their spread; rerun to resume
        SEEDS=100 FIRST=100             how many, and the first; OUT=runs/seeds_circle
        ARGS="--preset circle_fast"     any flag of `qrl train`; --jobs N, --retry (seeds whose training failed)

@@ -87,10 +87,9 @@ class Ray:
 
 def _connect() -> None:
     """OSError if there is no cluster at RAY_ADDRESS, BadInput if that is no address."""
+    # Both of a cluster that is started here.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault(
-        "RAY_worker_niceness", "0"
-    )  # of a cluster that is started here; 15 would starve beside others
+    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 starves beside other work
     quietly: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
     address = os.environ.get("RAY_ADDRESS", "")
     host, _, port = address.rpartition(":")
@@ -103,9 +102,8 @@ def _connect() -> None:
         with suppress(ConnectionError):
             ray.init("auto", **quietly)
             return
-        os.environ.pop("RAY_ADDRESS", None)
-        cores = devices.cores()
-        ray.init("local", num_cpus=cores, object_store_memory=OBJECT_STORE_BYTES, include_dashboard=False, **quietly)
+        own = {"num_cpus": devices.cores(), "object_store_memory": OBJECT_STORE_BYTES, "include_dashboard": False}
+        ray.init("local", **own, **quietly)
     except ValueError as error:
         raise BadInput(f"RAY_ADDRESS={address}: {error}") from None
     except OSError as error:

@@ -102,7 +102,7 @@ def memory_bytes() -> float:
 
 
 def host_bytes() -> float:
-    """Half of this machine's memory; initializes no device, as is needed before `multihost.join`."""
+    """Half of this machine's memory; initializes no device."""
     return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2
 
 
