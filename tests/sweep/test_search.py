@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -104,16 +105,10 @@ def test_training_ends_with_the_trial(tmp_path: Path, others: float, reports: in
     chunk, device = chunk_of(grid, 2), jax.devices()[0]
     pruning = Pruning("return_mean", [{400: others, 800: others, 1200: others}] * 5)
     alone = runner.train(chunk, device, lambda: False, lambda _: None)
-    found = runner.train(replaced(chunk, pruning), device, lambda: False, lambda _: None)
+    found = runner.train(replace(chunk, pruning=pruning), device, lambda: False, lambda _: None)
     for index in (0, 1):
         rows = [without_clock(row) for row in found.results[index].rows]
         assert rows == [without_clock(row) for row in alone.results[index].rows[:reports]]
-
-
-def replaced(chunk: Any, pruning: Pruning) -> Any:
-    from dataclasses import replace
-
-    return replace(chunk, pruning=pruning)
 
 
 def without_clock(row: dict[str, Any]) -> dict[str, str]:
@@ -173,4 +168,5 @@ def test_a_search_needs_optuna(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert "key 'search': needs Optuna: pip install 'qrl[search]'" in complaint(capsys, "sweep", searched(tmp_path))
+    said = complaint(capsys, "sweep", searched(tmp_path), "--out", tmp_path / "out")
+    assert "key 'search': needs Optuna: pip install 'qrl[search]'" in said

@@ -240,7 +240,8 @@ def test_ray_is_asked_for_by_the_name_of_its_extra(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    said = complaint(capsys, "sweep", write_grid(tmp_path, {"gamma": [0.9]}), "--engine", "ray")
+    grid = write_grid(tmp_path, {"gamma": [0.9]})
+    said = complaint(capsys, "sweep", grid, "--out", tmp_path / "out", "--engine", "ray")
     assert said == "qrl: --engine ray: needs Ray: pip install 'qrl[ray]'\n"
 
 

@@ -77,7 +77,10 @@ def _holds_sweep(out: Path, grid: Grid) -> bool:
         return False
     stored = {key: value for key, value in read(path).items() if key not in ("versions", "devices")}
     if stored != json.loads(json.dumps(grid.record)):
-        raise BadInput(f"{out}: holds a sweep of another grid, or by another version of qrl ({path}); give another OUT")
+        version = "qrl or Optuna" if grid.file.search else "qrl"
+        raise BadInput(
+            f"{out}: holds a sweep of another grid, or by another version of {version} ({path}); give another OUT"
+        )
     return True
 
 
