@@ -49,11 +49,13 @@ class Nodes:
         return self._address
 
     def kill_second(self) -> None:
+        assert self.process.stdin
         self.process.stdin.write("kill\n")
         self.process.stdin.flush()
         self._said("killed")
 
     def _said(self, begin: str) -> str:
+        assert self.process.stdout
         return next(line for line in self.process.stdout if line.startswith(begin))
 
 

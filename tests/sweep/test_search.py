@@ -31,6 +31,11 @@ def searched(tmp_path: Path, **search: Any) -> Path:
     return write_grid(tmp_path, axes, fixed=FIXED, seeds=2, search=about)
 
 
+def proposed(grid: Grid, search: Search) -> Proposals:
+    assert grid.space
+    return Proposals(search, grid.space.axes)
+
+
 def report(step: int, value: float) -> dict[str, Any]:
     return {"env_steps": step, "updates": 1, "return_mean": value, "return_min": value, "success": math.nan}
 
@@ -49,7 +54,7 @@ def test_it_comes_nearer_to_an_optimum_than_chance(tmp_path: Path) -> None:
         return (math.log10(rate) + 1.5) ** 2 + {"a": 1.0, "b": 0.0, "c": 2.0}[name]
 
     def best(seed: int) -> float:
-        found, proposals = [], Proposals(Search(trials=40, seed=seed), grid.space.axes)
+        found, proposals = [], proposed(grid, Search(trials=40, seed=seed))
         while batch := proposals.ask():
             found += [loss(*values) for values in batch]
             proposals.tell([[([report(1, -loss(*values))], "")] for values in batch], [False] * len(batch))
@@ -66,7 +71,7 @@ def test_it_comes_nearer_to_an_optimum_than_chance(tmp_path: Path) -> None:
 def test_values_are_those_of_the_axes(tmp_path: Path) -> None:
     """Ranges within their ends, by their spacing; of lists their values."""
     grid = load(searched(tmp_path, trials=60), 1e9)
-    proposals = Proposals(Search(trials=60, batch=60), grid.space.axes)
+    proposals = proposed(grid, Search(trials=60, batch=60))
     rates, masses = zip(*proposals.ask(), strict=True)
     logs = np.log(np.array(rates) / 1e-4) / np.log(1e3)
     assert 0 <= logs.min() < 0.1 < 0.9 < logs.max() <= 1
@@ -106,6 +111,8 @@ def test_training_ends_with_the_trial(tmp_path: Path, others: float, reports: in
     pruning = Pruning("return_mean", [{400: others, 800: others, 1200: others}] * 5)
     alone = runner.train(chunk, device, lambda: False, lambda _: None)
     found = runner.train(replace(chunk, pruning=pruning), device, lambda: False, lambda _: None)
+    assert alone
+    assert found
     for index in (0, 1):
         rows = [without_clock(row) for row in found.results[index].rows]
         assert rows == [without_clock(row) for row in alone.results[index].rows[:reports]]
