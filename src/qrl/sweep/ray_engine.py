@@ -143,4 +143,4 @@ def _result(reference: Any) -> ChunkDone:
     except exceptions.RayTaskError as error:
         raise error.cause from None
     except exceptions.RayError as error:
-        raise OSError(f"Ray gave up a chunk: {error}") from None
+        raise OSError(f"Ray gave up a chunk; the same command goes on: {error}") from None
