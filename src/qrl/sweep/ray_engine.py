@@ -7,7 +7,6 @@ nodes share no file system, and a chunk is recorded once, whichever of its attem
 import os
 import socket
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ CONNECT_SECONDS = 10.0
 OBJECT_STORE_BYTES = 200_000_000  # of a cluster that a sweep starts itself: chunks and results are small
 PROCESS_BYTES = 1_000_000_000  # of a worker process beside its members: Python, JAX, programs
 TASK_BYTES = {"CPU": 2e9, "GPU": 8e9}  # default memory of a task's members
+QUIETLY: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
 PASSED_ON = ("JAX_", "XLA_")  # beginnings of the variables that a worker process has of this one's
 
 
@@ -86,28 +86,30 @@ class Ray:
 
 
 def _connect() -> None:
-    """OSError if there is no cluster at RAY_ADDRESS, BadInput if that is no address."""
-    # Both of a cluster that is started here.
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 starves beside other work
-    quietly: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "configure_logging": False}
+    """OSError if there is no cluster at RAY_ADDRESS, or none can be started; BadInput if that is no address."""
     address = os.environ.get("RAY_ADDRESS", "")
     host, _, port = address.rpartition(":")
     try:
         if host and port.isdigit() and "://" not in address:  # Ray itself would wait for minutes
             socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
-        if address:
-            ray.init(**quietly)
-            return
-        with suppress(ConnectionError):
-            ray.init("auto", **quietly)
-            return
-        own = {"num_cpus": devices.cores(), "object_store_memory": OBJECT_STORE_BYTES, "include_dashboard": False}
-        ray.init("local", **own, **quietly)
+        ray.init(address or "auto", **QUIETLY)
     except ValueError as error:
         raise BadInput(f"RAY_ADDRESS={address}: {error}") from None
     except OSError as error:
-        raise OSError(f"RAY_ADDRESS={address}: no Ray cluster can be reached there: {error}") from None
+        if address:
+            raise OSError(f"RAY_ADDRESS={address}: no Ray cluster can be reached there: {error}") from None
+        _start()
+
+
+def _start() -> None:
+    """A cluster of this machine alone, for as long as this process lives."""
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 starves beside other work
+    own = {"num_cpus": devices.cores(), "object_store_memory": OBJECT_STORE_BYTES, "include_dashboard": False}
+    try:
+        ray.init("local", **own, **QUIETLY)
+    except Exception as error:  # Ray raises just that where it has not started in half a minute
+        raise OSError(f"Ray does not start on this machine: {error}") from None
 
 
 def _variables(on_cpu: bool) -> dict[str, str]:
