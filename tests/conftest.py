@@ -16,6 +16,15 @@ from cross_targets import need
 from qrl.export import targets
 from qrl.export.targets import Core
 
+# Most of a test's time is XLA's: what it compiles runs for milliseconds. So it compiles in haste, here and in the
+# processes that tests start, and all alike, so that what is compiled is shared. `make smoke` and tests of long runs
+# (`optimized`) compile as a user's command does; under QRL_STRESS fusions are a user's in all tests.
+HASTY_FUSIONS = "--xla_cpu_use_fusion_emitters=false"  # compiles in half the time
+os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+jax.config.update("jax_disable_most_optimizations", True)
+if os.environ.get("QRL_STRESS") != "1" and HASTY_FUSIONS not in os.environ.get("XLA_FLAGS", ""):
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {HASTY_FUSIONS}".strip()
+
 # Chosen by --hypothesis-profile. The default's cases are the same each time; those of `make stress` are drawn anew.
 # The deadline of a case is for what hangs: the machine may be busy.
 settings.register_profile("default", max_examples=100, deadline=10_000, derandomize=True, database=None)
@@ -52,20 +61,13 @@ def _threads() -> Iterator[None]:
     as_it_was()
 
 
-def _quickly() -> Iterator[None]:
-    """For what runs for milliseconds, here or in a process that a test starts: XLA's optimizations would take twice the
-    time of the rest.
-    """
+@pytest.fixture
+def optimized() -> Iterator[None]:
+    """For a test whose programs run for longer than they take to compile."""
     before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-        yield
+    jax.config.update("jax_disable_most_optimizations", False)
+    yield
     jax.config.update("jax_disable_most_optimizations", before)
-
-
-quick_compilation = pytest.fixture(_quickly)
-quick_compilation_of_module = pytest.fixture(scope="module")(_quickly)
 
 
 @pytest.fixture

@@ -15,8 +15,6 @@ from qrl import api
 from qrl.cli import train as command
 from qrl_envs.specfile import BadInput
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 TINY: dict[str, Any] = TINY_VALUES | {"quiet": True}
 
 

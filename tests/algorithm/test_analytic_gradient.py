@@ -27,8 +27,6 @@ from qrl.training.trainer import Trainer
 from qrl_envs.specfile import BadInput
 from small_run import comparable_metrics, run_config, train
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 WITH_APG = {
     "apg_fraction": 0.4,
     "apg_num_envs": 4,

@@ -10,8 +10,6 @@ from qrl.algorithm import flights
 from qrl_envs import env as worlds
 from qrl_envs.controllers import geometric
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 EDGE, STEPS = 1.2, 9
 
 

@@ -25,8 +25,6 @@ from qrl.training import trainer
 from qrl.training.state import MemberInputs
 from qrl.training.trainer import Setup
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 Array = np.ndarray
 
 B, T, F, A = 4, 7, 5, 2

@@ -10,8 +10,6 @@ from qrl.algorithm.learner import LearnerState, UpdateMetrics
 from qrl.algorithm.types import Transition
 from qrl.config import Config, Hyperparameters, load_preset
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 B, T, F, A = 3, 7, 5, 2
 
 

@@ -7,8 +7,6 @@ import pytest
 
 from qrl.algorithm.networks import MLP
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 F = 5
 
 

@@ -21,8 +21,6 @@ from qrl.algorithm.networks import GRU
 from qrl.config import Config
 from small_run import run_config, train
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 NETWORK = GRU((5,), 6, 2, "tanh", 0.5)
 INPUTS, LANES, T = 3, 4, 25
 

@@ -16,7 +16,6 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # flashbax's own imports
     import flashbax
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
 Array = np.ndarray
 

@@ -20,8 +20,6 @@ from qrl.training.trainer import Setup
 from qrl_envs import env as worlds
 from qrl_envs import task
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 Array = np.ndarray
 
 LANES, T, LONGEST, UNROLLS = 6, 6, 12, 5

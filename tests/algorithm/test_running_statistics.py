@@ -10,8 +10,6 @@ from hypothesis import strategies as st
 
 from qrl.algorithm.running_statistics import MIN_STD, init, std, update
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 F = 3
 
 update_ours, update_theirs = jax.jit(update), jax.jit(brax_statistics.update)

@@ -73,7 +73,6 @@ def test_brax_is_imported_for_its_own_tasks_alone() -> None:
     assert said == "[('hover', 4, False), ('pendulum', 1, False), ('fast', 1, True)]\n"
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_evaluate_flies_off_nominal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every seed, with a table for each; what is nominal is said as without the flag."""
     task, run = tmp_path / "short.json", tmp_path / "run"
@@ -297,7 +296,6 @@ def test_evaluate_of_no_run_is_refused(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.skipif(not STRESS, reason="part of make stress: Brax's own physics take a minute to compile")
-@pytest.mark.usefixtures("quick_compilation")
 def test_foreign_environment_trains(tmp_path: Path) -> None:
     """Our learner on one of Brax's own environments, which measures no success."""
     assert qrl("train", "inverted_pendulum", "--out", tmp_path / "run", "--episode-length", "20", *TINY.split()) == 0

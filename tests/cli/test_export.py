@@ -167,7 +167,6 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
 @pytest.mark.parametrize(
     ("task", "vehicle", "inputs"), [("circle", ["--vehicle", "crazyflie"], 12 + 4 + 5), ("any", [], 15 + 9 + 4 + 3)]
 )
-@pytest.mark.usefixtures("quick_compilation")
 def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], inputs: int, tmp_path: Path) -> None:
     """With all memory, a preview, and actions that are rotor speeds: the policy is the one that was trained, and the
     kernel is verified.

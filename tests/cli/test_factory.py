@@ -9,8 +9,6 @@ import pytest
 
 from cli_helpers import TINY, complaint, qrl
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 MODULE = '''
 import jax.numpy as jnp
 from jax import random

@@ -7,8 +7,6 @@ import pytest
 
 from cli_helpers import TINY, complaint, qrl
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -34,8 +34,6 @@ from qrl_envs import measures, viewer
 from qrl_envs import task as tasks
 from qrl_envs.viewer import Recording
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 Array = np.ndarray
 Build = Callable[[str], Path]
 

@@ -18,8 +18,6 @@ from qrl_envs import env, measures, quadrotor, symmetry, task
 from qrl_envs.controllers import geometric, lqr, mixer
 from qrl_envs.env import QuadrotorEnv
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 Array = np.ndarray
 Controller = Callable[[jax.Array], jax.Array]
 CONTROLLERS = {"geometric": geometric.controller, "lqr": lqr.controller}

@@ -12,8 +12,6 @@ from qrl_envs.distribution import VehicleDistribution
 from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.specfile import BadInput
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 N = 3000
 
 

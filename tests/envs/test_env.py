@@ -20,8 +20,6 @@ import qrl_envs
 from qrl_envs import env, quadrotor, task
 from qrl_envs.env import Lane, TaskEnv
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 Array = np.ndarray
 
 LANES = 6

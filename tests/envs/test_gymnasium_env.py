@@ -15,8 +15,6 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from qrl_envs import env, task
 from qrl_envs.gymnasium_env import BraxVectorEnv
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 Array = np.ndarray
 N, EPISODE_STEPS = 5, 7
 

@@ -13,8 +13,6 @@ from qrl.algorithm.analytic_gradient import _constant_leaves
 from qrl_envs import task
 from qrl_envs.env import RealQuadrotorEnv, from_task
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 CASES = [
     ("hover", None),
     ("circle", None),

@@ -3,14 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from qrl.algorithm import flights as evaluate
 from qrl_envs import env, off_nominal, task
 from qrl_envs.off_nominal import Condition, OffNominal
 from qrl_envs.uncertainty import Uncertainty
-
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 
 NOISE = {name: (size, size) for name, size in off_nominal.NOISE.items()}
 

@@ -16,7 +16,6 @@ from qrl_envs import noise, plant, quadrotor, rotors, task
 from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.uncertainty import Uncertainty
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 Array = np.ndarray
 DT_S = 0.01
 

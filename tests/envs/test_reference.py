@@ -15,8 +15,6 @@ from qrl_envs.reference import FixedReference, Random, evaluation_s
 from qrl_envs.specfile import BadInput
 from qrl_envs.target import Figure, Motion, Sines
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 POINTS = [[0.0, 0.0, 0.0], [1.0, 0.2, 0.3], [1.2, 1.0, -0.1], [-0.5, 0.8, 0.2], [0.0, 0.0, 0.0]]
 TIMES = [0.0, 1.1, 2.0, 3.4, 5.0]
 FIXED: dict[str, dict[str, Any]] = {

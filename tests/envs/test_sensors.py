@@ -12,7 +12,6 @@ from qrl_envs import noise, task
 from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.uncertainty import Uncertainty
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 Array = np.ndarray
 DT_S = 0.01
 BOUND = 6 / np.sqrt(noise.ROWS)  # the tables have so many rows, which all flights share: six sigmas of a mean

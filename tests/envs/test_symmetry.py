@@ -18,7 +18,6 @@ from qrl_envs.env import TaskEnv
 from qrl_envs.symmetry import Symmetry
 from qrl_envs.target import Sines
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 DRAWS = 64
 PLUS = {
     "motors": [

@@ -298,7 +298,6 @@ def test_flights_are_drawn_as_they_were_flown() -> None:
     assert sorted(float(y[0]) for y in (x.get_ydata() for x in axes.lines) if len(y) == 2) == [-2.0, 2.0]
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -85,7 +85,6 @@ def log(out: Path, seed: int) -> str:
 # A campaign
 
 
-@pytest.mark.usefixtures("quick_compilation")
 def test_two_seeds_are_trained_and_fly_the_starts_of_evaluate(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

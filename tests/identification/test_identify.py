@@ -16,7 +16,6 @@ from qrl.identification import flight_log, model, report
 from qrl_envs import specfile
 from qrl_envs.vehicle import Vehicle, vehicle_data, with_default_scale
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
 START = vehicle_data("crazyflie")
 FACTORS = (1.12, 0.93, 1.05, 0.9)
 CHANGES: dict[str, Any] = {

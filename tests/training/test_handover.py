@@ -18,8 +18,6 @@ from qrl.training.state import MemberInputs, TrainState, stack
 from qrl.training.trainer import Trainer, make_trainer
 from small_run import comparable_metrics, run_config, train
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 # 30 unrolls: 12 to learn, or 24, or 26, where a quarter of the 9 APG updates, of two unrolls each, is left.
 RUN = run_config(
     apg_fraction=0.6,

@@ -14,8 +14,6 @@ from qrl.training.state import member_inputs
 from qrl.training.trainer import Setup
 from small_run import pendulum, run_config
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 LANES, UNROLLS, UPDATES, BATCH, APG_UPDATES, APG_LANES, T = 4, 4, 3, 4, 3, 4, 10
 DRAWS = ("bits", "normal", "uniform")
 

@@ -17,8 +17,6 @@ from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
 from small_run import comparable_metrics, run_config, train
 
-pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
-
 
 @pytest.fixture(autouse=True)
 def _quick_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
