@@ -1,6 +1,7 @@
 """What tests share: programs of one shape are compiled once in a session, machines to run kernels on, a tiny run."""
 
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from hypothesis import settings
 import once
 from cli_helpers import TINY, qrl
 from cross_targets import need
+from qrl.evaluation import calibration
 from qrl.export import targets
 from qrl.export.targets import Core
 
@@ -88,9 +90,30 @@ def core(request: pytest.FixtureRequest) -> Core | None:
     return request.param
 
 
+def _trained(factory: pytest.TempPathFactory, task: str, *words: str) -> Path:
+    """A copy, of this worker, of a run of 400 steps that the first of the workers trains."""
+
+    def train(folder: Path) -> None:
+        assert qrl("train", task, "--out", folder / "run", *words, *TINY.split()) == 0
+
+    made = once.made_once(factory, f"trained {task}", train) / "run"
+    return Path(shutil.copytree(made, factory.mktemp("runs") / task))
+
+
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a pendulum run of 400 steps. Add to it only what no other test would miss or find."""
-    out = tmp_path_factory.mktemp("runs") / "pendulum"
-    assert qrl("train", "pendulum", "--out", out, *TINY.split()) == 0
-    return out
+    return _trained(tmp_path_factory, "pendulum")
+
+
+@pytest.fixture(scope="session")
+def trained_foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One of Brax's own environment `fast`, which compiles at once; not to be changed."""
+    return _trained(tmp_path_factory, "fast", "--episode-length", "20")
+
+
+@pytest.fixture
+def little_export(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For exports by command: few flights to calibrate on, and no emulated cores, which tests/export has."""
+    monkeypatch.setattr(calibration, "STARTS", 10)
+    monkeypatch.setattr(targets, "missing_tools", lambda _: ["the cross compiler"])

@@ -213,6 +213,7 @@ interrupted_circle() {
   trap - TERM
   ((code == 1)) || fail "Ctrl-C: exit code $code, not 1"
   ! grep -q Traceback "$log/stdout" "$log/stderr" || fail "Ctrl-C: a traceback"
+  grep -q RESUME=1 "$log/stdout" || fail "Ctrl-C: the way on is not said"
   [[ ! -e $out/circle/summary.json ]] || fail "Ctrl-C: it went on to the end"
 }
 

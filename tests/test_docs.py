@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from cli_helpers import TINY_VALUES
+from qrl import api
 from qrl.cli.main import build_parser
 from qrl.config import Config, preset_names
 
@@ -171,9 +173,17 @@ def test_presets_named_in_pages_exist() -> None:
             assert name in preset_names(), (page.name, name)
 
 
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All code cells, in order, in this process."""
+@pytest.fixture
+def tiny(little_export: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """In an empty folder; what is trained is tiny, whatever the preset."""
+    train = api.train
+    monkeypatch.setattr(api, "train", lambda *words, **flags: train(*words, **(TINY_VALUES | flags)))
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.usefixtures("tiny")
+def test_the_notebook_runs(tmp_path: Path) -> None:
+    """All code cells, in order, in this process."""
     notebook = json.loads((ROOT / "docs" / "first_flight.ipynb").read_text(encoding="utf-8"))
     namespace: dict[str, object] = {}
     for cell in notebook["cells"]:
@@ -182,9 +192,9 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert (tmp_path / "runs" / "notebook" / "export" / "qrl_pendulum.c").exists()
 
 
-def test_the_readme_snippet_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All python blocks of README, in order, in this process; the programs are those of the notebook."""
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("tiny")
+def test_the_readme_snippet_runs(tmp_path: Path) -> None:
+    """All python blocks of README, in order, in this process."""
     namespace: dict[str, object] = {}
     for block in fenced(ROOT / "README.md", "python"):
         exec(compile(block, "README.md", "exec"), namespace)

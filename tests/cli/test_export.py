@@ -17,7 +17,6 @@ from qrl import tasks
 from qrl.cli import export
 from qrl.evaluation import calibration
 from qrl.evaluation.trained_run import TrainedRun, inputs_in_si, vehicle_name
-from qrl.export import targets
 from qrl.export.kernel import AccumulatorOverflow
 from qrl.export.policy import Memory
 from qrl.export.quantize import UnsupportedNetwork
@@ -35,11 +34,7 @@ def exported_files(name: str) -> set[str]:
 FILES = exported_files("qrl_pendulum")
 
 
-@pytest.fixture(autouse=True)
-def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Few flights to calibrate on, and no Cortex-M: test_verify.py has those."""
-    monkeypatch.setattr(calibration, "STARTS", 10)
-    monkeypatch.setattr(targets, "missing_tools", lambda _: ["the cross compiler"])
+pytestmark = pytest.mark.usefixtures("little_export")
 
 
 @pytest.fixture
@@ -132,11 +127,10 @@ def test_without_a_compiler_it_exports_unverified(
 
 
 def test_a_foreign_environment_exports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    trained_foreign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """One of Brax's own, the one that compiles at once: all that is known of its ports is their order."""
-    run = tmp_path / "run"
-    assert qrl("train", "fast", "--out", run, "--episode-length", "20", *TINY.split()) == 0
+    run = shutil.copytree(trained_foreign, tmp_path / "run")
     assert "'fast' does not define `dt`" in complaint(capsys, "export", run, *LEAST)
     monkeypatch.setattr(Fast, "dt", 0.02, raising=False)  # as all but this one do
     assert qrl("export", run, *LEAST) == 0
@@ -178,13 +172,13 @@ def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], input
     assert policy.body_frame
     assert policy.body_frame.last
     env: Any = loaded.env
-    seen = np.array(jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
+    seen = np.array(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
     remembered = slice(policy.body_frame.measured, env.policy_observation_size)
     seen[:, remembered] = np.random.default_rng(0).uniform(-0.5, 0.5, seen[:, remembered].shape)
     units = policy.memory.units if policy.memory else 0
     assert bool(units) == (task == "any")
     h = np.random.default_rng(1).uniform(-0.9, 0.9, (20, units))
-    after, action = loaded.act(jnp.asarray(h) if units else (), seen)
+    after, action = jax.jit(loaded.act)(jnp.asarray(h) if units else (), seen)
     wanted = policy.to_si(np.asarray(action))
     assert np.ptp(wanted, axis=0).min() > 1e-4
     found_h, found = policy.respond(np.concatenate([inputs_in_si(policy, seen), h], axis=1))

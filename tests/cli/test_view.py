@@ -272,10 +272,11 @@ def test_wrong_starts_are_refused(
     assert says in complaint(capsys, "view", trained, *words)
 
 
-def test_what_is_no_run_of_ours_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_no_run_of_ours_is_refused(
+    trained_foreign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert "not a run folder" in complaint(capsys, "view", tmp_path)
-    run = tmp_path / "run"
-    assert qrl("train", "fast", "--out", run, "--episode-length", "20", *TINY.split()) == 0
+    run = shutil.copytree(trained_foreign, tmp_path / "run")
     assert "expected a run of one of our own tasks, found another environment, 'fast'" in complaint(capsys, "view", run)
     shutil.rmtree(run / "checkpoints")
     config = json.loads((run / "config.json").read_text())

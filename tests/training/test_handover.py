@@ -120,7 +120,7 @@ def test_what_does_not_fly_learns_on_and_another_beside_it_does_not(pair: tuple[
 def test_a_bounded_gradient_takes_over_from_what_does_not_fly() -> None:
     """It learns from flights that go wrong, so nothing is waited for."""
     bounded = CONFIG.model_copy(update={"apg_cotangent_norm": 10.0})
-    states, inputs, programs = start([CRASHES])
+    states, inputs, programs = start([CRASHES, CRASHES])  # by the programs of `pair`
     made = list(driver.run_chunks(states, inputs, programs, bounded, Clock(), lambda: False))
     assert made[-1].env_steps == CONFIG.num_timesteps
     assert not any(chunk.extended for chunk in made)

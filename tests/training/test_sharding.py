@@ -27,8 +27,7 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Values]:
 
 def train_on_devices(out: Path) -> None:
     program = Path(__file__).parents[1] / "helpers" / "on_devices.py"
-    # It runs for milliseconds: XLA's optimizations would take most of the time.
-    env = os.environ | {"JAX_NUM_CPU_DEVICES": "4", "JAX_PLATFORMS": "cpu", "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    env = os.environ | {"JAX_NUM_CPU_DEVICES": "4", "JAX_PLATFORMS": "cpu"}
     done = subprocess.run([sys.executable, program, out], env=env, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
 
