@@ -1,5 +1,6 @@
 """What tests share: programs of one shape are compiled once in a session, machines to run kernels on, a tiny run."""
 
+import gc
 import os
 import shutil
 from collections.abc import Iterator
@@ -26,6 +27,8 @@ os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
 jax.config.update("jax_disable_most_optimizations", True)
 if os.environ.get("QRL_STRESS") != "1" and HASTY_FUSIONS not in os.environ.get("XLA_FLAGS", ""):
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {HASTY_FUSIONS}".strip()
+
+gc.set_threshold(50_000, 10, 10)  # what is traced allocates much and frees little: a tenth of its time
 
 # Chosen by --hypothesis-profile. The default's cases are the same each time; those of `make stress` are drawn anew.
 # The deadline of a case is for what hangs: the machine may be busy.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cli_helpers import TINY, complaint, qrl
+from cli_helpers import TINY, complaint, qrl, untrained
 from fault_injection import STRESS
 from qrl.evaluation.baselines import CONTROLLERS
 from qrl_envs.plots import errors
@@ -69,9 +69,9 @@ def test_evaluate_flies_off_nominal(
 ) -> None:
     """Every seed, with a table for each, and a controller; exact, on the plant of real vehicles, is as nominal."""
     monkeypatch.delitem(CONTROLLERS, "geometric")  # one is enough: each is a large program
-    task, run = tmp_path / "short.json", tmp_path / "run"
+    task = tmp_path / "short.json"
     task.write_text('{"extend": "circle", "evaluation": {"duration_s": 0.3, "tail_s": 0.1}}')
-    assert qrl("train", task, "--out", run, "--seeds", "2", *TINY.split()) == 0
+    run = untrained(tmp_path / "run", task, "--seeds", "2")
     capsys.readouterr()
     assert qrl("evaluate", run, "--starts", "5", "--off-nominal") == 0
     said = capsys.readouterr().out
@@ -81,7 +81,7 @@ def test_evaluate_flies_off_nominal(
         for each in (result, result["baselines"]["lqr"]):
             off = each["off_nominal"]
             assert {"exact", "lag_72ms", "latency", "mass_x1.3", "noise", "together"} < off.keys()
-            assert off["exact"]["return_mean"] == pytest.approx(each["return_mean"], rel=1e-3)
+            assert off["exact"]["return_mean"] == pytest.approx(each["return_mean"], rel=5e-3)
             assert len({one["return_mean"] for one in (each, *off.values())}) > 10
         assert f"seed {i}," in said
     assert said.count("\nlag_72ms ") == 3  # two seeds, a controller

@@ -22,7 +22,7 @@ from selenium.webdriver import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import Select
 
-from cli_helpers import TINY, complaint, qrl
+from cli_helpers import complaint, qrl, untrained
 from cross_targets import need
 from experiments.gallery import browser
 from qrl.cli.export import fly_kernel
@@ -246,8 +246,7 @@ def test_starts_that_fail_come_first(trained: Path, tmp_path: Path) -> None:
 
 
 def test_each_seed_has_its_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = tmp_path / "two"
-    assert qrl("train", "pendulum", "--seeds", "2", "--seed", "5", "--out", run, *TINY.split()) == 0
+    run = untrained(tmp_path / "two", "pendulum", "--seeds", "2", "--seed", "5")
     assert qrl("view", run, "--starts", "1") == 0
     one, other = (data_of((run / f"seed-{seed}" / "view.html").read_text("utf-8")) for seed in (5, 6))
     assert "seed 6" in other["title"]

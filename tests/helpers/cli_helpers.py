@@ -1,11 +1,19 @@
 """The command line, called as a user would, and a run that is over in a moment."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from qrl.cli.main import main
+from qrl import tasks
+from qrl.cli import train
+from qrl.cli.main import build_parser, main
+from qrl.runs import record
+from qrl.training import driver, loop
+from qrl.training.driver import Clock
+from qrl.training.state import member_inputs, stack
+from qrl.training.trainer import make_trainer
 
 TINY_VALUES: dict[str, Any] = {
     "num_timesteps": 400,
@@ -28,6 +36,24 @@ def qrl(*words: str | Path) -> int:
         return main([str(word) for word in words])
     except SystemExit as stop:
         return int(stop.code or 0)
+
+
+def untrained(out: Path, *words: str | Path) -> Path:
+    """The run folder `out` of the random policies that `qrl train words` begins with, for what only flies them: to
+    compile a program that trains takes most of a tiny run's time.
+    """
+    args = build_parser().parse_args(["train", *map(str, words), "--out", str(out), *TINY.split()])
+    with ExitStack() as locks:
+        plan = train.make_plan(args, locks)
+        assert plan
+        run, env = plan.config, tasks.environment(plan.config.task)
+        trainer, inputs = make_trainer(env, run.learner), stack([member_inputs(env, run.learner)] * run.seeds)
+        states = trainer.init(driver.seeds(run.seed, run.seeds), inputs)
+        for i, folder in enumerate(record.member_folders(out, run)):
+            member = loop.Member(folder, run.member(i), 0, [])
+            member.save(run.learner.steps_per_unroll, trainer.member(states, i), Clock())
+            member.close()
+    return out
 
 
 def complaint(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
