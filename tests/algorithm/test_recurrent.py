@@ -1,6 +1,6 @@
 """A recurrent policy: its cell, whole trajectories from their first memory, and its gradients."""
 
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +25,16 @@ NETWORK = GRU((5,), 6, 2, "tanh", 0.5)
 INPUTS, LANES, T = 3, 4, 25
 
 
+@cache
 def parameters(network: GRU = NETWORK) -> Any:
-    made = networks.init(network, jax.random.PRNGKey(1), jnp.zeros(INPUTS))
-    noise = jax.random.split(jax.random.PRNGKey(2), len(jax.tree.leaves(made)))
-    each = (x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(jax.tree.leaves(made), noise, strict=True))
-    return jax.tree.unflatten(jax.tree.structure(made), each)
+    @jax.jit
+    def made() -> Any:
+        of = networks.init(network, jax.random.PRNGKey(1), jnp.zeros(INPUTS))
+        noise = jax.random.split(jax.random.PRNGKey(2), len(jax.tree.leaves(of)))
+        each = (x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(jax.tree.leaves(of), noise, strict=True))
+        return jax.tree.unflatten(jax.tree.structure(of), each)
+
+    return made()
 
 
 def test_the_cell_is_flaxs() -> None:
@@ -54,21 +59,27 @@ def test_a_trajectory_is_its_steps_one_by_one() -> None:
     ended = (jax.random.uniform(keys[2], (LANES, T)) < 0.1).astype(jnp.float32)
     assert ended[:, :-1].any()
 
-    def by_step(params: Any, first: jax.Array) -> jax.Array:
-        rows = []
-        for lane in range(LANES):
-            memory = first[lane]
+    def by_step(params: Any) -> jax.Array:
+        def of_lane(memory: jax.Array, x: jax.Array, ended: jax.Array) -> jax.Array:
+            rows = []
             for t in range(T):
-                memory, output = networks.step(NETWORK, params, memory, x[lane, t])
+                memory, output = networks.step(NETWORK, params, memory, x[t])
                 rows.append(output)
-                memory = memory * (1.0 - ended[lane, t])
-        return jnp.stack(rows)
+                memory = memory * (1.0 - ended[t])
+            return jnp.stack(rows)
 
-    whole = partial(networks.unroll, NETWORK, x=x, ended=ended)
-    np.testing.assert_allclose(whole(params, memory=first), by_step(params, first), atol=1e-5)
+        return jax.vmap(of_lane)(first, x, ended).reshape(LANES * T, 2)
+
+    def whole(params: Any) -> jax.Array:
+        return networks.unroll(NETWORK, params, memory=first, x=x, ended=ended)
+
     weights = jax.random.normal(keys[0], (LANES * T, 2))
-    ours = jax.grad(lambda p: jnp.sum(weights * whole(p, memory=first)))(params)
-    theirs = jax.jit(jax.grad(lambda p: jnp.sum(weights * by_step(p, first))))(params)
+    both = (
+        jax.jit(jax.value_and_grad(lambda p, f=f: (jnp.sum(weights * f(p)), f(p)), has_aux=True))
+        for f in (whole, by_step)
+    )
+    ((_, output), ours), ((_, expected_output), theirs) = (f(params) for f in both)
+    np.testing.assert_allclose(output, expected_output, atol=1e-5)
     for found, expected in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
 
@@ -156,17 +167,18 @@ def test_the_gradient_of_flights_goes_through_the_memory() -> None:
         return values.sum()
 
     def literal(params: Any) -> jax.Array:
-        total = jnp.zeros(())
-        for key in keys:
-            state, memory, alive = env.reset(jax.random.split(key)[0]), jnp.zeros(6), jnp.ones(())
+        def of_flight(key: jax.Array) -> jax.Array:
+            total, state, memory, alive = jnp.zeros(()), env.reset(jax.random.split(key)[0]), jnp.zeros(6), jnp.ones(())
             for _ in range(steps):
                 memory, action = networks.step(network, params, memory, state.obs)
                 after = env.step(state, jnp.clip(action, -1.0, 1.0))
                 state = jax.tree.map(lambda new, old, alive=alive: jnp.where(alive > 0, new, old), after, state)
                 total, alive = total + state.reward, alive * (1.0 - state.done)
-        return total
+            return total
 
-    found, expected = jax.value_and_grad(ours)(params), jax.jit(jax.value_and_grad(literal))(params)
+        return jax.vmap(of_flight)(keys).sum()
+
+    found, expected = (jax.jit(jax.value_and_grad(f))(params) for f in (ours, literal))
     np.testing.assert_allclose(found[0], expected[0], rtol=1e-5)
     for one, other in zip(jax.tree.leaves(found[1]), jax.tree.leaves(expected[1]), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-5)
