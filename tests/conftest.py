@@ -20,8 +20,8 @@ from qrl.export import targets
 from qrl.export.targets import Core
 
 # Most of a test's time is XLA's: what it compiles runs for milliseconds. So it compiles in haste, here and in the
-# processes that tests start, and all alike, so that what is compiled is shared. `make smoke` and tests of long runs
-# (`optimized`) compile as a user's command does; under QRL_STRESS fusions are a user's in all tests.
+# processes that tests start, and all alike, so that what is compiled is shared. `make smoke` compiles as a user's
+# command does; under QRL_STRESS the fusions are a user's here, too.
 HASTY_FUSIONS = "--xla_cpu_use_fusion_emitters=false"  # compiles in half the time
 os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
 jax.config.update("jax_disable_most_optimizations", True)
@@ -64,15 +64,6 @@ def _threads() -> Iterator[None]:
     as_it_was()
     yield
     as_it_was()
-
-
-@pytest.fixture
-def optimized() -> Iterator[None]:
-    """For a test whose programs run for longer than they take to compile."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", False)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
 
 
 @pytest.fixture
