@@ -22,7 +22,7 @@ def drawn() -> Any:
     physics = quadrotor.physics(base.vehicle)
     u = jax.random.uniform(jax.random.PRNGKey(0), (N, own_vehicle.DRAWS))
     spec = VehicleDistribution()
-    return jax.tree.map(np.asarray, jax.vmap(lambda one: own_vehicle.draw(spec, physics, one))(u)), physics
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(lambda one: own_vehicle.draw(spec, physics, one)))(u)), physics
 
 
 def test_vehicles_are_within_their_ranges_and_fill_them(drawn: Any) -> None:

@@ -65,7 +65,7 @@ def test_parameters_and_a_flights_world_are_constant() -> None:
     """So they stay out of APG's loop, and what moves does not."""
     world = from_task(task.load("hover", "crazyflie"))
     assert isinstance(world, RealQuadrotorEnv)
-    states = jax.vmap(world.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 3))
+    states = jax.jit(jax.vmap(world.reset, out_axes=-1))(jax.random.split(jax.random.PRNGKey(0), 3))
     constant = _constant_leaves(world, states, jnp.zeros((4, 3))).pipeline_state
     assert all(jax.tree.leaves(constant.params))
     assert all(jax.tree.leaves(constant.x.world))

@@ -423,8 +423,9 @@ def test_nested_starts_have_ranges_of_their_own() -> None:
     """The same draws, each within the ranges times one factor for all of its coordinates, uniform in [0, 1)."""
     plain = quadrotor.Start(*map(jnp.float32, (1.0, 2.0, 3.0, np.pi)))
     keys = jax.random.split(jax.random.PRNGKey(0), 2000)
+    draw = jax.jit(jax.vmap(quadrotor.draw, in_axes=(None, 0)))
     drawn = {
-        name: jax.vmap(lambda key, start=start: quadrotor.draw(start, key))(keys)
+        name: draw(start, keys)
         for name, start in {
             "plain": plain,
             "nested": plain._replace(nested=jnp.float32(1.0)),

@@ -130,7 +130,7 @@ def motions(n: int, **values: Any) -> tuple[Motion, Sines]:
     physics = quadrotor.physics(task.load("hover", "crazyflie").vehicle)  # pyright: ignore[reportAttributeAccessIssue]
     u = jax.random.uniform(jax.random.PRNGKey(0), (n, motion.draws))
     thrust = jnp.float32(2.0 * 0.03 * 9.81)
-    return motion, jax.vmap(lambda one: motion.draw(one, physics, thrust))(u)
+    return motion, jax.jit(jax.vmap(lambda one: motion.draw(one, physics, thrust)))(u)
 
 
 def test_random_motion_is_smooth_and_within_what_the_vehicle_can() -> None:

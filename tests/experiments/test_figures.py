@@ -317,7 +317,7 @@ def test_the_trial_differs_from_the_first_starts_in_what_the_paper_tells(
     others = [*range(9), 15, 16, 17]
     np.testing.assert_array_equal(trial.observations[:, 0, others], nominal.observations[:, 0, others])
     env = worlds.make("hover").evaluation().env
-    starts = jax.vmap(env.reset)(evaluation_starts(2)).obs  # those of `qrl evaluate`
+    starts = jax.jit(jax.vmap(env.reset))(evaluation_starts(2)).obs  # those of `qrl evaluate`
     np.testing.assert_allclose(nominal.observations[:, 0], starts, rtol=1e-5, atol=1e-6)
     assert (trial.seed, trial.env_steps, trial.observations.shape) == (100, 7, (2, 801, 18))
     assert trial.measures["success"].shape == (2,)
