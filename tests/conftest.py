@@ -12,6 +12,7 @@ import jax
 import pytest
 from hypothesis import settings
 
+import haste
 import once
 from cli_helpers import TINY, qrl
 from cross_targets import need
@@ -19,15 +20,7 @@ from qrl.evaluation import calibration
 from qrl.export import targets
 from qrl.export.targets import Core
 
-# Most of a test's time is XLA's: what it compiles runs for milliseconds. So it compiles in haste, here and in the
-# processes that tests start, and all alike, so that what is compiled is shared. `make smoke` compiles as a user's
-# command does; under QRL_STRESS the fusions are a user's here, too.
-HASTY_FUSIONS = "--xla_cpu_use_fusion_emitters=false"  # compiles in half the time
-os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
-jax.config.update("jax_disable_most_optimizations", True)
-if os.environ.get("QRL_STRESS") != "1" and HASTY_FUSIONS not in os.environ.get("XLA_FLAGS", ""):
-    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {HASTY_FUSIONS}".strip()
-
+haste.compile_in_haste()
 gc.set_threshold(50_000, 10, 10)  # what is traced allocates much and frees little: a tenth of its time
 
 # Chosen by --hypothesis-profile. The default's cases are the same each time; those of `make stress` are drawn anew.

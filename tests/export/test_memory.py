@@ -203,13 +203,14 @@ def literal_integers(kernel: Kernel, x: list[int] | None, action: list[int], tot
 @WHICH
 def test_the_integer_policy_is_the_literal_loop(which: str) -> None:
     """Both entries, through observations of every kind."""
-    kernel, wanted = policies.remembering_kernel(which), drawn(which, "relu", FEW)
+    n = 2 * vectors.LENGTH
+    kernel, wanted = policies.remembering_kernel(which), drawn(which, "relu", n)
     assert kernel.memory
     for entry in ("step", "step_i16"):
         observations = wanted.obs if entry == "step" else wanted.obs_i16
         finite = np.isfinite(observations).all(axis=1)
         quantized = reference.quantized(kernel, wanted.obs)[0] if entry == "step" else observations
-        for first in range(0, FEW, wanted.length):
+        for first in range(0, n, wanted.length):
             state = reference.initial_state(kernel, 1)
             start = kernel.memory.initial_action
             action = [0] * len(kernel.act_lsb) if start is None else start.tolist()

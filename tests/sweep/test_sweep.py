@@ -29,6 +29,8 @@ from qrl_envs import env as worlds
 from qrl_envs.specfile import BadInput
 from sweep_helpers import Rows, chunk_of, rows_of, write_grid
 
+pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
+
 AXES = {"learning_rate": [1e-3, 1e-2, 1e30], "task.rod.mass_kg": [1.3, 1.0]}  # the last step size diverges
 
 
