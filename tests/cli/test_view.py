@@ -410,6 +410,7 @@ def of_color(pixels: Array, color: str, near: int = 40) -> int:
 
 
 each_page = pytest.mark.parametrize("page", TASKS, indirect=True, scope="module")
+each_vehicle = pytest.mark.parametrize("page", ["hover", "pendulum"], indirect=True, scope="module")
 
 
 @each_page
@@ -431,7 +432,7 @@ def test_it_is_drawn(shown: Shown) -> None:
     assert shown.requests() == []
 
 
-@each_page
+@each_vehicle
 def test_scrubbing_moves_all_of_it(shown: Shown) -> None:
     before, place, cursors = shown.pixels("#scene"), shown.ask("qrlView.place()"), shown.cursors()
     shown.seek(1.0)
@@ -485,7 +486,7 @@ def test_it_plays_and_pauses(shown: Shown, small_window: None) -> None:
     assert shown.errors() == []
 
 
-@each_page
+@each_vehicle
 def test_another_start_is_another_scene(shown: Shown) -> None:
     before, place = shown.pixels("#scene"), shown.ask("qrlView.place()")
     charts = shown.pixels("#charts")
@@ -541,7 +542,7 @@ def test_the_camera_follows(shown: Shown) -> None:
     assert shown.errors() == []
 
 
-@each_page
+@each_vehicle
 def test_it_fits_the_window(shown: Shown) -> None:
     """A laptop's, and then a phone's, on which a page scrolls."""
     try:

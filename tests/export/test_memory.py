@@ -286,18 +286,18 @@ def test_a_tenth_of_a_millimeter_counts(which: str) -> None:
         return
     if policy.memory.integral.circle_m:
         return  # `test_a_millimeter_from_the_circle_counts`
-    for axis, i in enumerate(policy.memory.integral.position):
-        p = max(round(1e-4 / kernel.lsb[i]), 1)
-        obs = np.zeros((1, len(kernel.scale)), np.int16)
-        for sign in (1, -1) if kernel.obs_min[i] < 0 else (1,):
-            obs[0, i] = sign * p
-            state = reference.initial_state(kernel, 1)
-            for _ in range(1000):
-                state, _, _ = reference.step_i16(kernel, state, obs)
-            total = remembered(kernel, state)[0, -3:]
-            wanted = min(sign * 1000 * policy.control_period_s * p * kernel.lsb[i], policy.memory.integral.limit_m_s)
-            np.testing.assert_allclose(total[axis], wanted, rtol=0.01)
-            assert not np.delete(total, axis).any()
+    axes = enumerate(policy.memory.integral.position)
+    each = [(axis, i, sign) for axis, i in axes for sign in ((1, -1) if kernel.obs_min[i] < 0 else (1,))]
+    obs = np.zeros((len(each), len(kernel.scale)), np.int16)
+    for row, (_, i, sign) in zip(obs, each, strict=True):
+        row[i] = sign * max(round(1e-4 / kernel.lsb[i]), 1)
+    state = reference.initial_state(kernel, len(each))
+    for _ in range(1000):
+        state, _, _ = reference.step_i16(kernel, state, obs)
+    for total, row, (axis, i, _) in zip(remembered(kernel, state)[:, -3:], obs, each, strict=True):
+        wanted = min(1000 * policy.control_period_s * row[i] * kernel.lsb[i], policy.memory.integral.limit_m_s)
+        np.testing.assert_allclose(total[axis], wanted, rtol=0.01)
+        assert not np.delete(total, axis).any()
 
 
 def test_a_millimeter_from_the_circle_counts() -> None:
@@ -307,16 +307,15 @@ def test_a_millimeter_from_the_circle_counts() -> None:
     assert policy.memory.integral
     radius_m = policy.memory.integral.circle_m
     assert radius_m
-    for turn in (0.0, 1.0, 2.5, 4.0):
-        for away_m in (1e-3, -1e-3):
-            obs = np.zeros((1, 18), np.float32)
-            obs[0, 9:11] = (radius_m + away_m) * np.array([np.cos(turn), np.sin(turn)])
-            state = reference.initial_state(kernel, 1)
-            for _ in range(1000):
-                state, _, _ = reference.step(kernel, state, obs)
-            total = remembered(kernel, state)[0, -4:-2]
-            each_m = total / (1000 * policy.control_period_s)
-            np.testing.assert_allclose(each_m, [away_m, 0.0], rtol=0, atol=radius_m / 2**13)
+    turn, away_m = (x.ravel() for x in np.meshgrid([0.0, 1.0, 2.5, 4.0], [1e-3, -1e-3]))
+    obs = np.zeros((len(turn), 18), np.float32)
+    obs[:, 9], obs[:, 10] = (radius_m + away_m) * np.cos(turn), (radius_m + away_m) * np.sin(turn)
+    state = reference.initial_state(kernel, len(turn))
+    for _ in range(1000):
+        state, _, _ = reference.step(kernel, state, obs)
+    each_m = remembered(kernel, state)[:, -4:-2] / (1000 * policy.control_period_s)
+    wanted_m = np.stack([away_m, 0.0 * away_m], axis=1)
+    np.testing.assert_allclose(each_m, wanted_m, rtol=0, atol=radius_m / 2**13)
 
 
 def test_a_position_has_the_finest_steps() -> None:
