@@ -323,19 +323,29 @@ def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, golde
 
 def _layer_tables(index: int, layer: _Layer) -> str:
     weight, outputs = layer.weight, len(layer.dense.bias)
-    tiles = weight.reshape(len(weight) // 4, 4, -1, 4).swapaxes(1, 2).reshape(-1, 4)
-    fours = (f"W4({', '.join(map(str, four))})" for four in tiles)
     bias, multiplier = (np.pad(x, (0, len(weight) - outputs)) for x in (layer.dense.bias, layer.dense.multiplier))
-    sums = weight.sum(axis=1)
+    with_sums = np.stack([bias, weight.sum(axis=1)], axis=1).reshape(-1, 8)
     return "\n".join(
         [
-            f"static const union {{\n    weight w[{weight.size}];\n    int32_t aligned;\n}} weights_{index} = {{{{",
-            *_lines(fours, 4),
+            f"static const union {{\n    weight w[{len(weight)} * (({weight.shape[1]} + TILE - 1) / TILE) * TILE];",
+            f"    int32_t aligned;\n}} weights_{index} = {{{{",
+            *_lines(_tiles(weight), 1),
             "}};",
-            _array(f"int32_t biases_{index}[{len(bias)}]", map("BIAS({}, {})".format, bias, sums), 5),
+            _array(f"accumulator biases_{index}[{len(bias)}]", (f"B4({', '.join(map(str, b))})" for b in with_sums), 1),
             _array(f"factors factors_{index}[]", (f"M2({a}, {b})" for a, b in multiplier.reshape(-1, 2)), 8),
         ]
     )
+
+
+def _tiles(weight: Ints) -> Iterable[str]:
+    """Tiles of four outputs and eight inputs, the last of four where eight do not go into the inputs."""
+    for rows in weight.reshape(-1, 4, weight.shape[1]):
+        for at in range(0, weight.shape[1], 8):
+            tile = rows[:, at : at + 8]
+            numbers = [", ".join(map(str, row)) for row in tile]
+            joint = ",\n       "
+            halves = ", ".join(numbers[:2]), ", ".join(numbers[2:])
+            yield f"W{tile.shape[1]}({joint.join(halves)})"
 
 
 def _integrals(golden: Vectors, integral: Integral) -> Ints:

@@ -11,10 +11,13 @@
  *     acc = bias + sum(weight * x)                    |acc| <= @acc_bound@ for any x: proved at export
  *     y   = saturate(floor(acc * multiplier / 2^(16 + shift)))          the bias includes the rounding half
  *
- * Three implementations with identical results: Arm with the DSP extension (Cortex-M4, M7, M33 ...), Armv6-M
- * (Cortex-M0, M0+), and C99 for all others.
+ * Four implementations with identical results: Arm with Helium (Cortex-M55, M85 ...), with the DSP extension (Cortex-M4,
+ * M7, M33 ...), Armv6-M (Cortex-M0, M0+), and C99 for all others.
  */
-#if defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
+#if defined(__ARM_FEATURE_MVE) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
+#define BODY_MVE
+#include <arm_mve.h>
+#elif defined(__ARM_FEATURE_DSP) && defined(__thumb2__) && defined(__GNUC__) && !defined(__ARM_BIG_ENDIAN)
 #define BODY_DSP
 #elif (defined(__ARM_ARCH_6M__) || defined(__ARM_ARCH_8M_BASE__)) && defined(__GNUC__)
 #define BODY_ARMV6M
@@ -30,21 +33,22 @@ typedef char needs_arithmetic_right_shift[(-1 >> 1) == -1 ? 1 : -1];
 typedef char the_state_has_its_size[sizeof(@name@_state) == @state_size@ ? 1 : -1];
 
 #ifdef BODY_ARMV6M
-/* These cores load bytes with an offset as unsigned only. With u = w + 2^7, v = x + 2^15, modulo 2^32, where
-   sum(u v) = sum(w x) + 2^15 sum(w) + 2^7 sum(v): the second sum is a constant, the third is shared by all rows. */
-typedef uint8_t weight;
+/* No load of bytes there extends their sign, and no other instruction is to spare for it. With u = w + 2^7, v = x + 2^15,
+   modulo 2^32, sum(u v) = sum(w x) + 2^15 sum(w) + 2^7 sum(v): the second sum is a constant, the third is shared by all
+   rows. */
 typedef uint16_t activation;
-typedef uint32_t accumulator;
-#define Q(w) ((w) + 128)
-#define BIAS(bias, sum_of_weights) ((int32_t)((uint32_t)(bias)-32768u * (uint32_t)(sum_of_weights)))
 #define OFFSET 32768
 #else
-typedef int8_t weight;
 typedef int16_t activation;
-typedef int32_t accumulator;
-#define Q(w) (w)
-#define BIAS(bias, sum_of_weights) (bias)
 #define OFFSET 0
+#endif
+
+#if defined(BODY_DSP) || defined(BODY_ARMV6M)
+typedef uint8_t weight;
+typedef uint32_t accumulator;
+#else
+typedef int8_t weight;
+typedef int32_t accumulator;
 #endif
 
 #ifdef BODY_DSP /* pairs of halfwords */
@@ -57,8 +61,44 @@ typedef uint16_t factors;
 #define FOUR 4
 #endif
 
-/* The weights of one output for four inputs. SXTB16 takes bytes 0 and 2, so the middle two are swapped. */
-#define W4(w0, w1, w2, w3) Q(w0), Q(w2), Q(w1), Q(w3)
+/* Weights come in tiles of four outputs, a to d: W4 has four inputs, W8 eight. A body lays them out as it reads them. B4
+   has the biases of four outputs and the sums of their weights. */
+#if defined(BODY_MVE) /* a load has eight inputs of an output */
+#define TILE 8
+#define W4(a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3) \
+    W8(a0, a1, a2, a3, 0, 0, 0, 0, b0, b1, b2, b3, 0, 0, 0, 0, c0, c1, c2, c3, 0, 0, 0, 0, d0, d1, d2, d3, 0, 0, 0, 0)
+#define W8(...) __VA_ARGS__
+#define B4(a, sum_a, b, sum_b, c, sum_c, d, sum_d) a, b, c, d
+#else
+#define TILE 4
+#define W8(a0, a1, a2, a3, a4, a5, a6, a7, b0, b1, b2, b3, b4, b5, b6, b7, c0, c1, c2, c3, c4, c5, c6, c7, d0, d1, d2, d3, \
+           d4, d5, d6, d7)                                                        \
+    W4(a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3),           \
+        W4(a4, a5, a6, a7, b4, b5, b6, b7, c4, c5, c6, c7, d4, d5, d6, d7)
+#if defined(BODY_DSP)
+/* Halfwords of two outputs: u_a + 2^8 w_b with u = w + 2^7. The sum of their products with x is that of u_a x plus 2^8 times
+   that of w_b x, which their upper bytes give: modulo 2^32 the first follows. */
+#define W2(a, b) (weight)((a) + 128), (weight)(b)
+#define UP(a, b) (uint32_t)(a) + 256u * (uint32_t)(b)
+#define B4(a, sum_a, b, sum_b, c, sum_c, d, sum_d) UP(a, b), UP(b, 0), UP(c, d), UP(d, 0)
+#define W4(a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3) \
+    W2(a0, b0), W2(a1, b1), W2(a2, b2), W2(a3, b3), W2(c0, d0), W2(c1, d1), W2(c2, d2), W2(c3, d3)
+#elif defined(BODY_ARMV6M)
+/* Words of four outputs. The accumulators sum the products with x of the whole word, of it shifted by one byte, by two and
+   by three; the fourth is that of the last output, and modulo 2^32 each of the others is its own output's plus 2^8 times the
+   next accumulator. */
+#define W1(a, b, c, d) (weight)((a) + 128), (weight)((b) + 128), (weight)((c) + 128), (weight)((d) + 128)
+#define B1(bias, sum) ((uint32_t)(bias)-32768u * (uint32_t)(sum))
+#define B4(a, sum_a, b, sum_b, c, sum_c, d, sum_d)                                                           \
+    B1(a, sum_a) + (B1(b, sum_b) << 8) + (B1(c, sum_c) << 16) + (B1(d, sum_d) << 24),                        \
+        B1(b, sum_b) + (B1(c, sum_c) << 8) + (B1(d, sum_d) << 16), B1(c, sum_c) + (B1(d, sum_d) << 8), B1(d, sum_d)
+#define W4(a0, a1, a2, a3, b0, b1, b2, b3, c0, c1, c2, c3, d0, d1, d2, d3) \
+    W1(a0, b0, c0, d0), W1(a1, b1, c1, d1), W1(a2, b2, c2, d2), W1(a3, b3, c3, d3)
+#else
+#define W4(...) __VA_ARGS__
+#define B4(a, sum_a, b, sum_b, c, sum_c, d, sum_d) a, b, c, d
+#endif
+#endif
 
 #define TANH @tanh@ /* else ReLU */
 #define PREVIOUS_ACTION @previous_action@ /* inputs of the network after the observation: the previous action, */
@@ -70,14 +110,17 @@ typedef uint16_t factors;
 #define TURN @turn@ /* whether they are in the body frame */
 #define KEPT @kept@ /* inputs that are remembered */
 
+/* A multiple of the tile's inputs. */
+#define WIDEST ((@widest@ + TILE - 1) / TILE * TILE)
+
 union activations {
-    activation one[@widest@];
-    int32_t two[@widest@ / 2]; /* pairs, aligned */
+    activation one[WIDEST];
+    int32_t two[WIDEST / 2]; /* pairs, aligned */
 };
 
 struct layer {
-    const weight *weights; /* tiles of 4 outputs x 4 inputs, along the inputs first */
-    const int32_t *biases;
+    const weight *weights; /* tiles, along the inputs first */
+    const accumulator *biases;
     const factors *of_rows; /* below 2^15 */
     uint16_t inputs;             /* inputs and outputs are multiples of 4, padded with zeros */
     uint16_t outputs;
@@ -127,67 +170,112 @@ struct error {
 
 @tables@
 
-/* Adds to four accumulators: the weights from `w` on times the activations from `x` to `last`. */
+/* The sums of four outputs: the biases plus the weights from `w` on times the activations from `x` to `last`. */
 struct four {
     accumulator a0, a1, a2, a3;
 };
 
-#if defined(BODY_DSP)
-
-/* A word holds four weights of one output: SXTB16 spreads the even bytes, then, rotated, the odd ones. */
-#define ROW(word, a)                          \
-    "sxtb16 %[t], %[" word "]\n\t"            \
-    "smlad  %[" a "], %[t], %[x0], %[" a "]\n\t" \
-    "sxtb16 %[t], %[" word "], ror #8\n\t"    \
-    "smlad  %[" a "], %[t], %[x1], %[" a "]\n\t"
+#if defined(BODY_MVE)
 
 static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
-    accumulator a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
-    int32_t w0, w1, x0, x1, t;
-    __asm__ volatile(
-        "1:\n\t"
-        "ldrd   %[x0], %[x1], [%[x]], #8\n\t"
-        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" ROW("w0", "a0") ROW("w1", "a1")
-        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" ROW("w0", "a2") ROW("w1", "a3")
-        "cmp    %[x], %[last]\n\t"
-        "bne    1b"
-        : [a0] "+r"(a0), [a1] "+r"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+r"(w), [x] "+r"(x), [w0] "=&r"(w0),
-          [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1), [t] "=&r"(t)
-        : [last] "r"(last)
-        : "cc", "memory");
+    int32_t a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+    for (int n = (int)(last - x + 7) >> 3; n > 0; --n, x += 8, w += 32) { /* beyond `last` the weights are 0 */
+        const int16x8_t in = vldrhq_s16(x);
+        a0 = vmladavaq_s16(a0, vldrbq_s16(w), in);
+        a1 = vmladavaq_s16(a1, vldrbq_s16(w + 8), in);
+        a2 = vmladavaq_s16(a2, vldrbq_s16(w + 16), in);
+        a3 = vmladavaq_s16(a3, vldrbq_s16(w + 24), in);
+    }
     s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
     return w;
 }
 
+#elif defined(BODY_DSP)
+
+/* A word, of two outputs and two inputs. */
+#define WORD(word, in, upper, lower)                             \
+    "smlad  %[" upper "], %[" word "], %[" in "], %[" upper "]\n\t" \
+    "sxtb16 %[" word "], %[" word "], ror #8\n\t"                \
+    "smlad  %[" lower "], %[" word "], %[" in "], %[" lower "]\n\t"
+
+static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
+    accumulator a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+    uint32_t w0, w1, x0, x1;
+    __asm__ volatile(
+        "1:\n\t"
+        "ldrd   %[x0], %[x1], [%[x]], #8\n\t"
+        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" WORD("w0", "x0", "a0", "a1") WORD("w1", "x1", "a0", "a1")
+        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" WORD("w0", "x0", "a2", "a3") WORD("w1", "x1", "a2", "a3")
+        "cmp    %[x], %[last]\n\t"
+        "bne    1b"
+        : [a0] "+r"(a0), [a1] "+r"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+r"(w), [x] "+r"(x), [w0] "=&r"(w0),
+          [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1)
+        : [last] "r"(last)
+        : "cc", "memory");
+    s->a0 = a0 - (a1 << 8), s->a1 = a1, s->a2 = a2 - (a3 << 8), s->a3 = a3;
+    return w;
+}
+
+/* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
+static inline accumulator sum_of(const activation *x, const activation *last) {
+    accumulator sum = 0;
+    uint32_t x0, x1;
+    __asm__ volatile(
+        "1:\n\t"
+        "ldrd   %[x0], %[x1], [%[x]], #8\n\t"
+        "smlad  %[sum], %[x0], %[ones], %[sum]\n\t"
+        "smlad  %[sum], %[x1], %[ones], %[sum]\n\t"
+        "cmp    %[x], %[last]\n\t"
+        "bne    1b"
+        : [sum] "+r"(sum), [x] "+r"(x), [x0] "=&r"(x0), [x1] "=&r"(x1)
+        : [last] "r"(last), [ones] "r"(0x10001)
+        : "cc", "memory");
+    return sum << 7;
+}
+
 #elif defined(BODY_ARMV6M)
 
-#define MAC(offset, a)                     \
-    "ldrb %[t], [%[w], #" offset "]\n\t"   \
-    "muls %[t], %[in], %[t]\n\t"           \
+#define MAC(word, shift, a)                    \
+    "lsrs %[t], " word ", #" shift "\n\t"      \
+    "muls %[t], %[in], %[t]\n\t"               \
     "add  %[" a "], %[t]\n\t"
-#define COLUMN(in, o0, o1, o2, o3) "ldrh %[in], [%[x], #" in "]\n\t" MAC(o0, "a0") MAC(o1, "a1") MAC(o2, "a2") MAC(o3, "a3")
+#define COLUMN(word, in)                       \
+    "ldrh %[in], [%[x], #" in "]\n\t"          \
+    MAC(word, "24", "a3") MAC(word, "16", "a2") MAC(word, "8", "a1") \
+    "muls " word ", %[in], " word "\n\t"       \
+    "add  %[a0], " word "\n\t"
 
-/* Two accumulators in low registers, two in the high ones that no compiler setting reserves. */
 static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
     accumulator a0 = s->a0, a1 = s->a1;
     register accumulator a2 __asm__("r12");
     register accumulator a3 __asm__("r14");
+    register uint32_t w0 __asm__("r4");
+    register uint32_t w1 __asm__("r5");
     uint32_t in, t;
     a2 = s->a2, a3 = s->a3;
     __asm__ volatile(
         ".syntax unified\n"
-        "1:\n\t" COLUMN("0", "0", "4", "8", "12") COLUMN("2", "2", "6", "10", "14") COLUMN("4", "1", "5", "9", "13")
-            COLUMN("6", "3", "7", "11", "15")
-        "adds %[w], %[w], #16\n\t"
+        "1:\n\t"
+        "ldmia %[w]!, {r4, r5}\n\t" COLUMN("r4", "0") COLUMN("r5", "2")
+        "ldmia %[w]!, {r4, r5}\n\t" COLUMN("r4", "4") COLUMN("r5", "6")
         "adds %[x], %[x], #8\n\t"
         "cmp  %[x], %[last]\n\t"
         "bne  1b"
-        : [a0] "+l"(a0), [a1] "+l"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
-          [t] "=&l"(t)
-        : [last] "l"(last)
+        : [a0] "+l"(a0), [a1] "+h"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
+          [t] "=&l"(t), "=&l"(w0), "=&l"(w1)
+        : [last] "h"(last)
         : "cc", "memory");
-    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
+    s->a0 = a0 - (a1 << 8), s->a1 = a1 - (a2 << 8), s->a2 = a2 - (a3 << 8), s->a3 = a3;
     return w;
+}
+
+/* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
+static inline accumulator sum_of(const activation *x, const activation *last) {
+    accumulator sum = 0;
+    for (; x != last; x += 4) {
+        sum += (accumulator)x[0] + x[1] + x[2] + x[3];
+    }
+    return sum << 7;
 }
 
 #else
@@ -198,9 +286,9 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
         int32_t in = x[0];
         a0 += w[0] * in, a1 += w[4] * in, a2 += w[8] * in, a3 += w[12] * in;
         in = x[1];
-        a0 += w[2] * in, a1 += w[6] * in, a2 += w[10] * in, a3 += w[14] * in;
-        in = x[2];
         a0 += w[1] * in, a1 += w[5] * in, a2 += w[9] * in, a3 += w[13] * in;
+        in = x[2];
+        a0 += w[2] * in, a1 += w[6] * in, a2 += w[10] * in, a3 += w[14] * in;
         in = x[3];
         a0 += w[3] * in, a1 += w[7] * in, a2 += w[11] * in, a3 += w[15] * in;
     }
@@ -254,7 +342,7 @@ static inline int32_t activated(int32_t z) {
 
 #endif
 
-#if !defined(BODY_DSP) || INTEGRAL
+#if !(defined(BODY_DSP) || defined(BODY_MVE)) || INTEGRAL
 
 /* floor(x * factor / 2^16) */
 static inline int32_t scaled(int32_t x, uint32_t factor) {
@@ -268,10 +356,32 @@ static inline int32_t scaled(int32_t x, uint32_t factor) {
 #endif
 
 /* The outputs of four accumulators; `hidden` layers have an activation. */
-#ifdef BODY_DSP
+#if defined(BODY_MVE)
+
+static inline void four_outputs(union activations *y, int at, const struct four *s, const factors *factor, int shift,
+                                int hidden) {
+    int32x4_t z = vdupq_n_s32(0);
+    z = vsetq_lane_s32(s->a0, z, 0), z = vsetq_lane_s32(s->a1, z, 1);
+    z = vsetq_lane_s32(s->a2, z, 2), z = vsetq_lane_s32(s->a3, z, 3);
+    const int32x4_t above = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(factor)), 16);
+    z = vshlq_r_s32(vmulhq_s32(z, above), -shift);
+    z = vmaxq_s32(vminq_s32(z, vdupq_n_s32(32767)), vdupq_n_s32(hidden && !TANH ? 0 : -32768));
+#if TANH
+    if (hidden) {
+        const uint32x4_t place = vreinterpretq_u32_s32(vaddq_n_s32(vshrq_n_s32(z, 8), 128));
+        const int32x4_t low = vldrhq_gather_shifted_offset_s32(tanh_table, place);
+        const int32x4_t high = vldrhq_gather_shifted_offset_s32(tanh_table + 1, place);
+        const int32x4_t part = vandq_s32(z, vdupq_n_s32(255));
+        z = vaddq_s32(low, vrshrq_n_s32(vmulq_s32(vsubq_s32(high, low), part), 8));
+    }
+#endif
+    vstrhq_s32(y->one + at, z);
+}
+
+#elif defined(BODY_DSP)
 
 /* Two factors, and two outputs, in a word. */
-static inline int32_t two_outputs(int32_t acc0, int32_t acc1, uint32_t factor, int shift, int hidden) {
+static inline int32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t factor, int shift, int hidden) {
     int32_t z0, z1, word;
     __asm__("smulwb %0, %1, %2" : "=r"(z0) : "r"(acc0), "r"(factor));
     __asm__("smulwt %0, %1, %2" : "=r"(z1) : "r"(acc1), "r"(factor));
@@ -308,20 +418,20 @@ static inline void four_outputs(union activations *y, int at, const struct four 
 static void dense(const struct layer *l, const activation *x, union activations *y) {
     const activation *const last = x + l->inputs;
     const weight *w = l->weights;
-    const int32_t *bias = l->biases;
+    const accumulator *bias = l->biases;
     const factors *factor = l->of_rows;
     const int shift = l->shift;
-    accumulator shared = 0;
-#ifdef BODY_ARMV6M
-    for (const activation *v = x; v != last; v += 4) {
-        shared += (accumulator)v[0] + v[1] + v[2] + v[3];
-    }
-    shared *= 128u;
+#if defined(BODY_DSP) || defined(BODY_ARMV6M)
+    const accumulator shared = sum_of(x, last);
 #endif
     for (int at = 0; at < l->outputs; at += 4, bias += 4, factor += FOUR) {
-        struct four s = {(accumulator)bias[0] - shared, (accumulator)bias[1] - shared, (accumulator)bias[2] - shared,
-                         (accumulator)bias[3] - shared};
+        struct four s = {bias[0], bias[1], bias[2], bias[3]};
         w = accumulate(&s, w, x, last);
+#if defined(BODY_DSP)
+        s.a0 -= shared, s.a2 -= shared;
+#elif defined(BODY_ARMV6M)
+        s.a0 -= shared, s.a1 -= shared, s.a2 -= shared, s.a3 -= shared;
+#endif
         if (l->hidden) {
             four_outputs(y, at, &s, factor, shift, 1);
         } else {
