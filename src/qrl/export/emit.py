@@ -285,8 +285,8 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
     parts += [_layer_tables(i, layer) for i, layer in enumerate(layers)]
     rows = (
-        f"{{weights_{i}.w, biases_{i}, factors_{i}, {layer.shape[1]}, {layer.shape[0]},"
-        f" {int(layer.hidden)}, {layer.dense.shift}}}"
+        f"{{weights_{i}.w, outputs_{i}, outputs_{i} + {layer.shape[0] // 4}, {layer.shape[1]}, {int(layer.hidden)},"
+        f" {layer.dense.shift}}}"
         for i, layer in enumerate(layers)
     )
     parts.append(_array("struct layer layers[LAYERS]", rows, 1))
@@ -324,15 +324,19 @@ def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, golde
 def _layer_tables(index: int, layer: _Layer) -> str:
     weight, outputs = layer.weight, len(layer.dense.bias)
     bias, multiplier = (np.pad(x, (0, len(weight) - outputs)) for x in (layer.dense.bias, layer.dense.multiplier))
-    with_sums = np.stack([bias, weight.sum(axis=1)], axis=1).reshape(-1, 8)
+    rows = (
+        "{{B4(%s)}, {M2(%s, %s), M2(%s, %s)}}" % (", ".join(f"{a}, {b}" for a, b in zip(*sums, strict=True)), *factors)
+        for sums, factors in zip(
+            np.stack([bias, weight.sum(axis=1)], axis=1).reshape(-1, 4, 2).swapaxes(1, 2), multiplier.reshape(-1, 4)
+        )
+    )
     return "\n".join(
         [
             f"static const union {{\n    weight w[{len(weight)} * (({weight.shape[1]} + TILE - 1) / TILE) * TILE];",
             f"    int32_t aligned;\n}} weights_{index} = {{{{",
             *_lines(_tiles(weight), 1),
             "}};",
-            _array(f"accumulator biases_{index}[{len(bias)}]", (f"B4({', '.join(map(str, b))})" for b in with_sums), 1),
-            _array(f"factors factors_{index}[]", (f"M2({a}, {b})" for a, b in multiplier.reshape(-1, 2)), 8),
+            _array(f"struct outputs outputs_{index}[{len(bias) // 4}]", rows, 1),
         ]
     )
 

@@ -118,13 +118,17 @@ union activations {
     int32_t two[WIDEST / 2]; /* pairs, aligned */
 };
 
+/* Of four outputs. */
+struct outputs {
+    accumulator biases[4];
+    factors factors[FOUR]; /* below 2^15 */
+};
+
 struct layer {
     const weight *weights; /* tiles, along the inputs first */
-    const accumulator *biases;
-    const factors *of_rows; /* below 2^15 */
-    uint16_t inputs;             /* inputs and outputs are multiples of 4, padded with zeros */
-    uint16_t outputs;
-    uint8_t hidden;              /* 1: the activation follows */
+    const struct outputs *outputs, *end;
+    uint16_t inputs; /* inputs and outputs are multiples of 4, padded with zeros */
+    uint8_t hidden;  /* 1: the activation follows */
     uint8_t shift;
 };
 
@@ -265,7 +269,7 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
           [t] "=&l"(t), "=&l"(w0), "=&l"(w1)
         : [last] "h"(last)
         : "cc", "memory");
-    s->a0 = a0 - (a1 << 8), s->a1 = a1 - (a2 << 8), s->a2 = a2 - (a3 << 8), s->a3 = a3;
+    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
     return w;
 }
 
@@ -298,6 +302,8 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
 
 #endif
 
+#if !(defined(BODY_MVE) || defined(BODY_ARMV6M))
+
 /* Saturated to 16 bits. */
 static inline int32_t saturated(int32_t z) {
 #ifdef SATURATE
@@ -308,27 +314,8 @@ static inline int32_t saturated(int32_t z) {
 #endif
 }
 
-#if TANH || UNITS
-
-/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; z within 16 bits. */
-static inline int32_t tanh_of(int32_t z) {
-    const int16_t *const at = tanh_table + 128 + (z >> 8);
-    const int32_t low = at[0];
-    return low + (((at[1] - low) * (z & 255) + 128) >> 8);
-}
-
-#endif
-
-#if TANH
-
-static inline int32_t activated(int32_t z) {
-    return tanh_of(saturated(z));
-}
-
-#else
-
 /* ReLU: within [0, 32767]. */
-static inline int32_t activated(int32_t z) {
+static inline int32_t rectified(int32_t z) {
 #ifdef SATURATE
     __asm__("usat %0, #15, %1" : "=r"(z) : "r"(z));
     return z;
@@ -342,7 +329,18 @@ static inline int32_t activated(int32_t z) {
 
 #endif
 
-#if !(defined(BODY_DSP) || defined(BODY_MVE)) || INTEGRAL
+#if TANH || UNITS
+
+/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; z within 16 bits. */
+static inline int32_t tanh_of(int32_t z) {
+    const int16_t *const at = tanh_table + 128 + (z >> 8);
+    const int32_t low = at[0];
+    return low + (((at[1] - low) * (z & 255) + 128) >> 8);
+}
+
+#endif
+
+#if INTEGRAL || !(defined(BODY_DSP) || defined(BODY_MVE) || defined(BODY_ARMV6M))
 
 /* floor(x * factor / 2^16) */
 static inline int32_t scaled(int32_t x, uint32_t factor) {
@@ -355,88 +353,138 @@ static inline int32_t scaled(int32_t x, uint32_t factor) {
 
 #endif
 
-/* The outputs of four accumulators; `hidden` layers have an activation. */
+/* Four outputs from their sums, saturated to 16 bits, of a layer with `relu` to [0, 32767]. */
 #if defined(BODY_MVE)
 
-static inline void four_outputs(union activations *y, int at, const struct four *s, const factors *factor, int shift,
-                                int hidden) {
+static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
     int32x4_t z = vdupq_n_s32(0);
     z = vsetq_lane_s32(s->a0, z, 0), z = vsetq_lane_s32(s->a1, z, 1);
     z = vsetq_lane_s32(s->a2, z, 2), z = vsetq_lane_s32(s->a3, z, 3);
     const int32x4_t above = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(factor)), 16);
     z = vshlq_r_s32(vmulhq_s32(z, above), -shift);
-    z = vmaxq_s32(vminq_s32(z, vdupq_n_s32(32767)), vdupq_n_s32(hidden && !TANH ? 0 : -32768));
-#if TANH
-    if (hidden) {
-        const uint32x4_t place = vreinterpretq_u32_s32(vaddq_n_s32(vshrq_n_s32(z, 8), 128));
-        const int32x4_t low = vldrhq_gather_shifted_offset_s32(tanh_table, place);
-        const int32x4_t high = vldrhq_gather_shifted_offset_s32(tanh_table + 1, place);
-        const int32x4_t part = vandq_s32(z, vdupq_n_s32(255));
-        z = vaddq_s32(low, vrshrq_n_s32(vmulq_s32(vsubq_s32(high, low), part), 8));
-    }
-#endif
-    vstrhq_s32(y->one + at, z);
+    vstrhq_s32(y, vmaxq_s32(vminq_s32(z, vdupq_n_s32(32767)), vdupq_n_s32(relu ? 0 : -32768)));
 }
 
 #elif defined(BODY_DSP)
 
 /* Two factors, and two outputs, in a word. */
-static inline int32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t factor, int shift, int hidden) {
+static inline int32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t factor, int shift, int relu) {
     int32_t z0, z1, word;
     __asm__("smulwb %0, %1, %2" : "=r"(z0) : "r"(acc0), "r"(factor));
     __asm__("smulwt %0, %1, %2" : "=r"(z1) : "r"(acc1), "r"(factor));
-    z0 = hidden ? activated(z0 >> shift) : saturated(z0 >> shift);
-    z1 = hidden ? activated(z1 >> shift) : saturated(z1 >> shift);
+    z0 = relu ? rectified(z0 >> shift) : saturated(z0 >> shift);
+    z1 = relu ? rectified(z1 >> shift) : saturated(z1 >> shift);
     __asm__("pkhbt %0, %1, %2, lsl #16" : "=r"(word) : "r"(z0), "r"(z1));
     return word;
 }
 
-static inline void four_outputs(union activations *y, int at, const struct four *s, const factors *factor, int shift,
-                                int hidden) {
-    y->two[at / 2] = two_outputs(s->a0, s->a1, factor[0], shift, hidden);
-    y->two[at / 2 + 1] = two_outputs(s->a2, s->a3, factor[1], shift, hidden);
+static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
+    int32_t *const two = (void *)y;
+    two[0] = two_outputs(s->a0, s->a1, factor[0], shift, relu);
+    two[1] = two_outputs(s->a2, s->a3, factor[1], shift, relu);
+}
+
+#elif defined(BODY_ARMV6M)
+
+/* floor(a0 * factor / 2^16) by halves, as there is no 64-bit product; what is saturated is rare. */
+#define OUTPUT(at, saturate)                                                                          \
+    "ldrh %[u], [%[f], #" at "]\n\t"                                                                  \
+    "asrs %[t], %[a0], #16\n\t"                                                                       \
+    "muls %[t], %[u], %[t]\n\t"                                                                       \
+    "uxth %[a0], %[a0]\n\t"                                                                           \
+    "muls %[a0], %[u], %[a0]\n\t"                                                                     \
+    "lsrs %[a0], %[a0], #16\n\t"                                                                      \
+    "adds %[a0], %[a0], %[t]\n\t"                                                                     \
+    "asrs %[a0], %[a0], %[shift]\n\t" saturate "strh %[a0], [%[y], #" at "]\n\t"
+#define NEXT(a) "mov  %[a0], %[" a "]\n\t"
+#define WITHOUT(above)                                                                                \
+    "mov  %[t], %[" above "]\n\t"                                                                     \
+    "lsls %[t], %[t], #8\n\t"                                                                         \
+    "subs %[a0], %[a0], %[t]\n\t"
+#define SHARED "subs %[a0], %[a0], %[shared]\n\t"
+#define FOUR_OUTPUTS(s, y, factor, shift, shared, saturate)                                           \
+    do {                                                                                              \
+        accumulator a0 = (s)->a0;                                                                     \
+        uint32_t t, u;                                                                                \
+        __asm__ volatile(".syntax unified\n" WITHOUT("a1") SHARED OUTPUT("0", saturate)               \
+                             NEXT("a1") WITHOUT("a2") SHARED OUTPUT("2", saturate)                    \
+                                 NEXT("a2") WITHOUT("a3") SHARED OUTPUT("4", saturate)                \
+                                     NEXT("a3") SHARED OUTPUT("6", saturate)                          \
+                         : [a0] "+l"(a0), [t] "=&l"(t), [u] "=&l"(u)                                  \
+                         : [a1] "h"((s)->a1), [a2] "h"((s)->a2), [a3] "h"((s)->a3), [f] "l"(factor), [y] "l"(y), \
+                           [shift] "l"(shift), [shared] "l"(shared), [offset] "h"(OFFSET)             \
+                         : "cc", "memory");                                                           \
+    } while (0)
+
+static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu,
+                                accumulator shared) {
+    if (relu) {
+        FOUR_OUTPUTS(s, y, factor, shift, shared,
+                     "asrs %[t], %[a0], #31\n\t"
+                     "bics %[a0], %[a0], %[t]\n\t"
+                     "lsrs %[t], %[a0], #15\n\t"
+                     "beq  1f\n\t"
+                     "movs %[a0], #1\n\t"
+                     "lsls %[a0], %[a0], #15\n\t"
+                     "subs %[a0], %[a0], #1\n"
+                     "1:\n\t"
+                     "add  %[a0], %[offset]\n\t");
+    } else {
+        FOUR_OUTPUTS(s, y, factor, shift, shared,
+                     "add  %[a0], %[offset]\n\t"
+                     "lsrs %[t], %[a0], #16\n\t"
+                     "beq  1f\n\t"
+                     "asrs %[a0], %[a0], #31\n\t"
+                     "mvns %[a0], %[a0]\n"
+                     "1:\n\t");
+    }
 }
 
 #else
 
-static inline activation output(accumulator acc, uint32_t factor, int shift, int hidden) {
-    const int32_t z = scaled((int32_t)acc, factor) >> shift;
-    return (activation)((hidden ? activated(z) : saturated(z)) + OFFSET);
+static inline activation output(accumulator acc, uint32_t factor, int shift, int relu) {
+    const int32_t z = scaled(acc, factor) >> shift;
+    return (activation)(relu ? rectified(z) : saturated(z));
 }
 
-static inline void four_outputs(union activations *y, int at, const struct four *s, const factors *factor, int shift,
-                                int hidden) {
-    y->one[at] = output(s->a0, factor[0], shift, hidden);
-    y->one[at + 1] = output(s->a1, factor[1], shift, hidden);
-    y->one[at + 2] = output(s->a2, factor[2], shift, hidden);
-    y->one[at + 3] = output(s->a3, factor[3], shift, hidden);
+static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
+    y[0] = output(s->a0, factor[0], shift, relu);
+    y[1] = output(s->a1, factor[1], shift, relu);
+    y[2] = output(s->a2, factor[2], shift, relu);
+    y[3] = output(s->a3, factor[3], shift, relu);
 }
 
 #endif
 
-/* One layer, four outputs at a time; x is aligned to pairs. */
-static void dense(const struct layer *l, const activation *x, union activations *y) {
+/* One layer, four outputs at a time; x and y are aligned to pairs. */
+static void dense(const struct layer *l, const activation *x, activation *y) {
     const activation *const last = x + l->inputs;
     const weight *w = l->weights;
-    const accumulator *bias = l->biases;
-    const factors *factor = l->of_rows;
-    const int shift = l->shift;
+    const int shift = l->shift, relu = l->hidden && !TANH;
 #if defined(BODY_DSP) || defined(BODY_ARMV6M)
     const accumulator shared = sum_of(x, last);
 #endif
-    for (int at = 0; at < l->outputs; at += 4, bias += 4, factor += FOUR) {
-        struct four s = {bias[0], bias[1], bias[2], bias[3]};
+    for (const struct outputs *o = l->outputs; o != l->end; ++o, y += 4) {
+        struct four s = {o->biases[0], o->biases[1], o->biases[2], o->biases[3]};
         w = accumulate(&s, w, x, last);
+#if defined(BODY_ARMV6M)
+#define SHARING , shared
+#else
+#define SHARING
+#endif
 #if defined(BODY_DSP)
         s.a0 -= shared, s.a2 -= shared;
-#elif defined(BODY_ARMV6M)
-        s.a0 -= shared, s.a1 -= shared, s.a2 -= shared, s.a3 -= shared;
 #endif
-        if (l->hidden) {
-            four_outputs(y, at, &s, factor, shift, 1);
+        if (relu) {
+            four_outputs(y, &s, o->factors, shift, 1 SHARING);
         } else {
-            four_outputs(y, at, &s, factor, shift, 0);
+            four_outputs(y, &s, o->factors, shift, 0 SHARING);
         }
+#if TANH
+        for (int i = 0; l->hidden && i < 4; ++i) {
+            y[i] = (activation)(tanh_of((int32_t)y[i] - OFFSET) + OFFSET);
+        }
+#endif
     }
 }
 
@@ -468,11 +516,11 @@ static inline int32_t sigmoid(activation i, activation m) {
    of x; `i` is overwritten. r = sigmoid(i + m), z = sigmoid(i + m), n = tanh(i + r * m), h = n + (h - n) * z */
 static void remember(const struct layer *l, union activations *a, union activations *i, int16_t h[UNITS]) {
     union activations m;
-    dense(l, a->one, i);
+    dense(l, a->one, i->one);
     for (int k = 0; k < (UNITS + 3) / 4 * 4; ++k) {
         a->one[k] = (activation)((k < UNITS ? h[k] : 0) + OFFSET);
     }
-    dense(l + 1, a->one, &m);
+    dense(l + 1, a->one, m.one);
     for (int k = 0; k < UNITS; ++k) {
         const activation *const ik = i->one + k, *const mk = m.one + k;
         const int32_t r = sigmoid(ik[0], mk[0]), z = sigmoid(ik[UNITS], mk[UNITS]);
@@ -494,7 +542,7 @@ static const activation *network(union activations *a, union activations *b, @na
             l += 2;
         }
 #endif
-        dense(l, a->one, b);
+        dense(l, a->one, b->one);
         union activations *const swapped = a;
         a = b;
         b = swapped;
