@@ -174,27 +174,42 @@ struct error {
 
 @tables@
 
-/* The sums of four outputs: the biases plus the weights from `w` on times the activations from `x` to `last`. */
+/* The sums of four outputs: the biases plus the weights from `w` on times the activations from `x` to `last`. Returns the
+   next weights. */
+#if defined(BODY_MVE)
+
+struct four {
+    int32x4_t sums;
+};
+
+#define ROW(a, q)                       \
+    "vldrb.s16 " q ", [%[w]], #8\n\t"   \
+    "vmladava.s16 %[" a "], " q ", q0\n\t"
+
+static inline const weight *accumulate(struct four *s, const accumulator *biases, const weight *w, const activation *x,
+                                       const activation *last) {
+    int32_t a0 = biases[0], a1 = biases[1], a2 = biases[2], a3 = biases[3];
+    const int eights = (int)(last - x + 7) / 8; /* beyond `last` the weights are 0 */
+    __asm__ volatile(
+        "dls  lr, %[eights]\n"
+        "1:\n\t"
+        "vldrh.u16 q0, [%[x]], #16\n\t" ROW("a0", "q1") ROW("a1", "q2") ROW("a2", "q1") ROW("a3", "q2")
+        "le   lr, 1b\n\t"
+        "vmov %q[sums][2], %q[sums][0], %[a0], %[a2]\n\t"
+        "vmov %q[sums][3], %q[sums][1], %[a1], %[a3]"
+        : [sums] "=w"(s->sums), [a0] "+Te"(a0), [a1] "+Te"(a1), [a2] "+Te"(a2), [a3] "+Te"(a3), [w] "+r"(w), [x] "+r"(x)
+        : [eights] "r"(eights)
+        : "q0", "q1", "q2", "lr", "memory");
+    return w;
+}
+
+#else
+
 struct four {
     accumulator a0, a1, a2, a3;
 };
 
-#if defined(BODY_MVE)
-
-static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
-    int32_t a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
-    for (int n = (int)(last - x + 7) >> 3; n > 0; --n, x += 8, w += 32) { /* beyond `last` the weights are 0 */
-        const int16x8_t in = vldrhq_s16(x);
-        a0 = vmladavaq_s16(a0, vldrbq_s16(w), in);
-        a1 = vmladavaq_s16(a1, vldrbq_s16(w + 8), in);
-        a2 = vmladavaq_s16(a2, vldrbq_s16(w + 16), in);
-        a3 = vmladavaq_s16(a3, vldrbq_s16(w + 24), in);
-    }
-    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
-    return w;
-}
-
-#elif defined(BODY_DSP)
+#if defined(BODY_DSP)
 
 /* A word, of two outputs and two inputs. */
 #define WORD(word, in, upper, lower)                             \
@@ -202,8 +217,9 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
     "sxtb16 %[" word "], %[" word "], ror #8\n\t"                \
     "smlad  %[" lower "], %[" word "], %[" in "], %[" lower "]\n\t"
 
-static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
-    accumulator a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+static inline const weight *accumulate(struct four *s, const accumulator *biases, const weight *w, const activation *x,
+                                       const activation *last) {
+    accumulator a0 = biases[0], a1 = biases[1], a2 = biases[2], a3 = biases[3];
     uint32_t w0, w1, x0, x1;
     __asm__ volatile(
         "1:\n\t"
@@ -249,14 +265,15 @@ static inline accumulator sum_of(const activation *x, const activation *last) {
     "muls " word ", %[in], " word "\n\t"       \
     "add  %[a0], " word "\n\t"
 
-static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
-    accumulator a0 = s->a0, a1 = s->a1;
+static inline const weight *accumulate(struct four *s, const accumulator *biases, const weight *w, const activation *x,
+                                       const activation *last) {
+    accumulator a0 = biases[0], a1 = biases[1];
     register accumulator a2 __asm__("r12");
     register accumulator a3 __asm__("r14");
     register uint32_t w0 __asm__("r4");
     register uint32_t w1 __asm__("r5");
     uint32_t in, t;
-    a2 = s->a2, a3 = s->a3;
+    a2 = biases[2], a3 = biases[3];
     __asm__ volatile(
         ".syntax unified\n"
         "1:\n\t"
@@ -284,8 +301,9 @@ static inline accumulator sum_of(const activation *x, const activation *last) {
 
 #else
 
-static inline const weight *accumulate(struct four *s, const weight *w, const activation *x, const activation *last) {
-    int32_t a0 = s->a0, a1 = s->a1, a2 = s->a2, a3 = s->a3;
+static inline const weight *accumulate(struct four *s, const accumulator *biases, const weight *w, const activation *x,
+                                       const activation *last) {
+    int32_t a0 = biases[0], a1 = biases[1], a2 = biases[2], a3 = biases[3];
     for (; x != last; x += 4, w += 16) {
         int32_t in = x[0];
         a0 += w[0] * in, a1 += w[4] * in, a2 += w[8] * in, a3 += w[12] * in;
@@ -300,6 +318,7 @@ static inline const weight *accumulate(struct four *s, const weight *w, const ac
     return w;
 }
 
+#endif
 #endif
 
 #if !(defined(BODY_MVE) || defined(BODY_ARMV6M))
@@ -357,12 +376,10 @@ static inline int32_t scaled(int32_t x, uint32_t factor) {
 #if defined(BODY_MVE)
 
 static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
-    int32x4_t z = vdupq_n_s32(0);
-    z = vsetq_lane_s32(s->a0, z, 0), z = vsetq_lane_s32(s->a1, z, 1);
-    z = vsetq_lane_s32(s->a2, z, 2), z = vsetq_lane_s32(s->a3, z, 3);
-    const int32x4_t above = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(factor)), 16);
-    z = vshlq_r_s32(vmulhq_s32(z, above), -shift);
-    vstrhq_s32(y, vmaxq_s32(vminq_s32(z, vdupq_n_s32(32767)), vdupq_n_s32(relu ? 0 : -32768)));
+    const int32x4_t upper = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(factor)), 16);
+    const int32x4_t z = vshlq_r_s32(vmulhq_s32(s->sums, upper), -shift);
+    const int16x8_t within = vqmovnbq_s32(vdupq_n_s16(0), z);
+    vstrhq_s32(y, vreinterpretq_s32_s16(relu ? vmaxq_s16(within, vdupq_n_s16(0)) : within));
 }
 
 #elif defined(BODY_DSP)
@@ -465,8 +482,8 @@ static void dense(const struct layer *l, const activation *x, activation *y) {
     const accumulator shared = sum_of(x, last);
 #endif
     for (const struct outputs *o = l->outputs; o != l->end; ++o, y += 4) {
-        struct four s = {o->biases[0], o->biases[1], o->biases[2], o->biases[3]};
-        w = accumulate(&s, w, x, last);
+        struct four s;
+        w = accumulate(&s, o->biases, w, x, last);
 #if defined(BODY_ARMV6M)
 #define SHARING , shared
 #else
