@@ -176,7 +176,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
-        "widest": str(max(_padded(len(kernel.scale)), *(size for layer in _layers(kernel) for size in layer.shape))),
+        "widest": str(_widest(kernel)),
         "tanh": str(int(kernel.activation == "tanh")),
         "tables": _tables(kernel, golden, name.upper()),
     }
@@ -228,28 +228,40 @@ def _port_lines(policy: Policy, kernel: Kernel) -> Iterable[str]:
 # -- C tables ------------------------------------------------------------------------------------------------
 
 
-def _padded(n: int) -> int:
-    return -(-n // 4) * 4
+def _padded(n: int, to: int = 4) -> int:
+    return -(-n // to) * to
+
+
+def _widest(kernel: Kernel) -> int:
+    """Of all that a buffer of activations holds."""
+    widest = max(_padded(len(kernel.scale)), *(size for layer in _layers(kernel) for size in layer.shape))
+    if unit := kernel.unit:
+        given = unit.of_input.weight.shape[1]
+        widest = max(widest, _padded(given, 8) + _padded(unit.units, 8), _padded(2 * unit.units) + 2 * _padded(unit.units))
+    return widest
 
 
 class _Layer(NamedTuple):
     """A layer as the C has it: weights [outputs, inputs], both padded to multiples of four."""
 
     dense: Dense
-    weight: Ints
+    parts: list[Ints]  # of the inputs x, and of a recurrent unit's gates those of its own numbers, which begin a tile
     hidden: bool
 
     @property
     def shape(self) -> tuple[int, int]:
-        return self.weight.shape[0], self.weight.shape[1]
+        return len(self.parts[0]), sum(part.shape[1] for part in self.parts)
 
 
 def _layers(kernel: Kernel) -> list[_Layer]:
     found = []
     for dense in kernel.products:
-        outputs, inputs = dense.weight.shape
-        weight = np.pad(dense.weight, ((0, -outputs % 4), (0, -inputs % 4)))
-        found.append(_Layer(dense, weight, hidden=any(dense is layer for layer in kernel.layers[:-1])))
+        own = [-kernel.unit.units] if kernel.unit and dense is kernel.unit.gates else []
+        parts = [
+            np.pad(part, ((0, -part.shape[0] % 4), (0, -part.shape[1] % 4)))
+            for part in np.split(dense.weight, own, axis=1)
+        ]
+        found.append(_Layer(dense, parts, hidden=any(dense is layer for layer in kernel.layers[:-1])))
     return found
 
 
@@ -274,7 +286,9 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
     if units := kernel.memory.units if kernel.memory else 0:
         assert kernel.unit
         numbers = {"UNIT_LAYER": len(kernel.layers) - 1}
-        numbers |= {"GATE_SHIFT": kernel.unit.gate_shift, "CANDIDATE_SHIFT": kernel.unit.shift}
+        numbers |= {"CANDIDATE_SHIFT": kernel.unit.shift, "MEMORY_SHIFT": kernel.unit.memory_shift}
+        given = _padded(kernel.unit.of_input.weight.shape[1])
+        numbers |= {"MEMORY_AT": f"TILES({given})", "INPUT_AT": _padded(2 * units), "PADDED_UNITS": _padded(units)}
         parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
         last = np.ascontiguousarray(golden.outputs.state[embedded(kernel) - 1, -2 * units :]).view("<i2")
         parts.append(_array("int16_t golden_recurrent[UNITS]", last, 12))
@@ -285,7 +299,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
     parts += [_layer_tables(i, layer) for i, layer in enumerate(layers)]
     rows = (
-        f"{{weights_{i}.w, outputs_{i}, outputs_{i} + {layer.shape[0] // 4}, {layer.shape[1]}, {int(layer.hidden)},"
+        f"{{weights_{i}.w, outputs_{i}, outputs_{i} + {layer.shape[0] // 4}, {_sizes(layer, '')}, {int(layer.hidden)},"
         f" {layer.dense.shift}}}"
         for i, layer in enumerate(layers)
     )
@@ -322,34 +336,41 @@ def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, golde
 
 
 def _layer_tables(index: int, layer: _Layer) -> str:
-    weight, outputs = layer.weight, len(layer.dense.bias)
-    bias, multiplier = (np.pad(x, (0, len(weight) - outputs)) for x in (layer.dense.bias, layer.dense.multiplier))
+    bias, multiplier, sums = (
+        np.pad(x, (0, -len(x) % 4)) for x in (layer.dense.bias, layer.dense.multiplier, layer.dense.weight.sum(axis=1))
+    )
     rows = (
         "{{B4(%s)}, {M2(%s, %s), M2(%s, %s)}}" % (", ".join(f"{a}, {b}" for a, b in zip(*sums, strict=True)), *factors)
         for sums, factors in zip(
-            np.stack([bias, weight.sum(axis=1)], axis=1).reshape(-1, 4, 2).swapaxes(1, 2), multiplier.reshape(-1, 4)
+            np.stack([bias, sums], axis=1).reshape(-1, 4, 2).swapaxes(1, 2), multiplier.reshape(-1, 4)
         )
     )
     return "\n".join(
         [
-            f"static const union {{\n    weight w[{len(weight)} * (({weight.shape[1]} + TILE - 1) / TILE) * TILE];",
+            f"static const union {{\n    weight w[{len(bias)} * ({_sizes(layer, 'TILES')})];",
             f"    int32_t aligned;\n}} weights_{index} = {{{{",
-            *_lines(_tiles(weight), 1),
+            *_lines(_tiles(layer), 1),
             "}};",
             _array(f"struct outputs outputs_{index}[{len(bias) // 4}]", rows, 1),
         ]
     )
 
 
-def _tiles(weight: Ints) -> Iterable[str]:
-    """Tiles of four outputs and eight inputs, the last of four where eight do not go into the inputs."""
-    for rows in weight.reshape(-1, 4, weight.shape[1]):
-        for at in range(0, weight.shape[1], 8):
-            tile = rows[:, at : at + 8]
-            numbers = [", ".join(map(str, row)) for row in tile]
-            joint = ",\n       "
-            halves = ", ".join(numbers[:2]), ", ".join(numbers[2:])
-            yield f"W{tile.shape[1]}({joint.join(halves)})"
+def _sizes(layer: _Layer, last: str) -> str:
+    """The inputs of a layer, of which each part but the last takes whole tiles."""
+    *whole, rest = (str(part.shape[1]) for part in layer.parts)
+    return " + ".join([*(f"TILES({size})" for size in whole), f"{last}({rest})" if last else rest])
+
+
+def _tiles(layer: _Layer) -> Iterable[str]:
+    """Tiles of four outputs and eight inputs, the last of four where eight do not go into a part's inputs."""
+    for at in range(0, layer.shape[0], 4):
+        for part in layer.parts:
+            for first in range(0, part.shape[1], 8):
+                tile = part[at : at + 4, first : first + 8]
+                numbers = [", ".join(map(str, row)) for row in tile]
+                halves = ",\n       ".join([", ".join(numbers[:2]), ", ".join(numbers[2:])])
+                yield f"W{tile.shape[1]}({halves})"
 
 
 def _integrals(golden: Vectors, integral: Integral) -> Ints:

@@ -84,15 +84,16 @@ class Memory:
 class GatedUnit:
     """A gated recurrent unit (`policy.GatedUnit`) of inputs x and h, in 1/32767.
 
-    r and z are (t + 32768) >> 1, t the tanh of (i + m)·2^gate_shift, which is half of the gate's sum; n is the tanh of
-    (i + ⌊r·m / 2¹⁵⌉)·2^shift; the next h is n + ⌊(h − n)·z / 2¹⁵⌉. The arguments of tanh are saturated, and so are i
-    and m, which the shifts keep within 16 bits.
+    With g = ⌊h / 2^memory_shift⌉, r and z are (t + 32768) >> 1, t the tanh of half of the gate's sum; n is the tanh of
+    (i + ⌊r·m / 2¹⁵⌉)·2^shift; the next h is n + ⌊(h − n)·z / 2¹⁵⌉. The arguments of tanh are saturated, and so are i and
+    m, which the shift keeps within 16 bits.
     """
 
-    of_input: Dense  # i: r, z, n
-    of_memory: Dense  # m
-    gate_shift: int  # in [0, 8]
+    gates: Dense  # half of the sums of r and z, of x and g
+    of_input: Dense  # i, of x
+    of_memory: Dense  # m, of g
     shift: int  # in [0, 8]
+    memory_shift: int  # in [0, 8]
 
     @property
     def units(self) -> int:
@@ -181,8 +182,8 @@ class Kernel:
 
     @property
     def products(self) -> list[Dense]:
-        """All layers in their order; a recurrent one is two."""
-        unit = [self.unit.of_input, self.unit.of_memory] if self.unit else []
+        """All layers in their order; a recurrent one is three."""
+        unit = [self.unit.gates, self.unit.of_input, self.unit.of_memory] if self.unit else []
         return [*self.layers[:-1], *unit, self.layers[-1]]
 
 
@@ -207,8 +208,10 @@ def accumulator_bound(kernel: Kernel) -> int:
     for i, layer in enumerate(kernel.layers):
         if kernel.unit and i == len(kernel.layers) - 1:
             h = np.full(kernel.unit.units, INT16 + 1)
+            g = shifted(h, kernel.unit.memory_shift)
+            bound("the recurrent unit's gates", kernel.unit.gates, np.concatenate([size, g]))
             bound("the recurrent unit's inputs", kernel.unit.of_input, size)
-            bound("the recurrent unit's memory", kernel.unit.of_memory, h)
+            bound("the recurrent unit's memory", kernel.unit.of_memory, g)
             size = h
         bound(f"layer {i}", layer, size)
         size = np.full(len(layer.bias), INT16 + 1)
@@ -250,7 +253,7 @@ def _check_fields(kernel: Kernel) -> None:
                     ("the circle's radius", circle.shift, 1, 30),
                 ]
     if kernel.unit:
-        ranges.append(("the recurrent unit's shift", np.array([kernel.unit.gate_shift, kernel.unit.shift]), 0, 8))
+        ranges.append(("the recurrent unit's shift", np.array([kernel.unit.shift, kernel.unit.memory_shift]), 0, 8))
     for layer in kernel.products:
         ranges += [
             ("a weight", layer.weight, -127, 127),
@@ -307,14 +310,10 @@ def network(kernel: Kernel, x: Ints, h: Ints | None = None) -> tuple[Ints, Ints]
 
 def remember(unit: GatedUnit, x: Ints, h: Ints) -> Ints:
     """The next h [n, H] for inputs x [n, D] and h."""
-    low = -INT16 - 1
-    i, m = (np.split(dense(layer, q, low), 3, axis=-1) for layer, q in ((unit.of_input, x), (unit.of_memory, h)))
-
-    def tanh(total: Ints, shift: int) -> Ints:
-        return _tanh(np.clip(total << shift, low, INT16))
-
-    r, z = (tanh(i[gate] + m[gate], unit.gate_shift) + INT16 + 1 >> 1 for gate in (0, 1))
-    n = tanh(i[2] + shifted(r * m[2], 15), unit.shift)
+    low, g = -INT16 - 1, shifted(h, unit.memory_shift)
+    r, z = np.split(_tanh(dense(unit.gates, np.concatenate([x, g], axis=-1), low)) + INT16 + 1 >> 1, 2, axis=-1)
+    total = dense(unit.of_input, x, low) + shifted(r * dense(unit.of_memory, g, low), 15)
+    n = _tanh(np.clip(total << unit.shift, low, INT16))
     return n + shifted((h - n) * z, 15)
 
 

@@ -142,28 +142,33 @@ def _gated_unit(
 ) -> tuple[integers.GatedUnit, Ints]:
     """The recurrent unit in integers, and its next h [n, H]; for its inputs in float, and x [n, D] in `step`."""
     h, units = np.round(h_float * INT16).astype(np.int64), h_float.shape[1]
-    sums = unit.sums(x_float, h_float)
-    # A gate is a tanh of half of its sum. The sums are added up, or scaled by r, after they were saturated: they need
-    # more than the tanh's range.
-    factors = np.repeat([2.0, 1.0], [2 * units, units])
-    largest = ACTIVATION_MARGIN * np.max([np.abs(part).max(axis=0) for part in sums], axis=0) / factors / TANH_RANGE
-    shifts = [
-        int(np.clip(np.ceil(np.log2(np.maximum(part.max(), 1e-9))), 0, 8))
-        for part in (largest[: 2 * units], largest[2 * units :])
-    ]
-    out = factors * 2.0 ** np.repeat(shifts, [2 * units, units]) * TANH_RANGE / (INT16 + 1)
-    of_input, of_memory = (
-        _dense(weight * lsb[:, None], target, q, slope, out, ridge)
-        for (weight, _), target, lsb, q, slope in zip(
-            (unit.of_input, unit.of_memory),
-            sums,
-            (step, np.full(units, 1.0 / INT16)),
-            (x, h),
-            sensitivity,
-            strict=True,
+    weight, own = unit.of_input[0], unit.of_memory[0]
+    i, m = unit.sums(x_float, h_float)
+    gates, candidate = slice(0, 2 * units), slice(2 * units, None)
+    # The candidate's sums are added up after they were saturated, the memory's scaled by r: they need more than the
+    # tanh's range.
+    largest = ACTIVATION_MARGIN * max(np.abs(part[:, candidate]).max() for part in (i, m)) / TANH_RANGE
+    shift = int(np.clip(np.ceil(np.log2(max(largest, 1e-9))), 0, 8))
+    # h in steps as coarse as make its weights as large as those of x, which share a scale.
+    size = np.abs(weight[:, gates] * step[:, None]).max() / max(np.abs(own[:, gates]).max(), 1e-9) * INT16
+    memory_shift = int(np.clip(np.round(np.log2(max(size, 1e-9))), 0, np.floor(np.log2(INT16 / MIN_LEVELS))))
+    out, lsb, g = TANH_RANGE / (INT16 + 1), np.full(units, 2.0**memory_shift / INT16), integers.shifted(h, memory_shift)
+    of_gates, of_input, of_memory = (
+        _dense(weight * lsb[:, None], target, q, slope, np.full(target.shape[1], out), ridge)
+        for weight, target, lsb, q, slope, out in (
+            (
+                np.concatenate([weight, own])[:, gates],
+                (i + m)[:, gates],
+                np.concatenate([step, lsb]),
+                np.concatenate([x, g], axis=1),
+                sensitivity[0][:, gates],
+                2.0 * out,  # a gate is a tanh of half of its sum
+            ),
+            (weight[:, candidate], i[:, candidate], step, x, sensitivity[0][:, candidate], out * 2.0**shift),
+            (own[:, candidate], m[:, candidate], lsb, g, sensitivity[1][:, candidate], out * 2.0**shift),
         )
     )
-    made = integers.GatedUnit(of_input, of_memory, *shifts)
+    made = integers.GatedUnit(of_gates, of_input, of_memory, shift, memory_shift)
     return made, integers.remember(made, x, h)
 
 

@@ -110,8 +110,9 @@ typedef uint16_t factors;
 #define TURN @turn@ /* whether they are in the body frame */
 #define KEPT @kept@ /* inputs that are remembered */
 
-/* A multiple of the tile's inputs. */
-#define WIDEST ((@widest@ + TILE - 1) / TILE * TILE)
+/* So many inputs, in whole tiles. */
+#define TILES(inputs) (((inputs) + TILE - 1) / TILE * TILE)
+#define WIDEST TILES(@widest@)
 
 union activations {
     activation one[WIDEST];
@@ -350,9 +351,9 @@ static inline int32_t rectified(int32_t z) {
 
 #if TANH || UNITS
 
-/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; z within 16 bits. */
+/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; of z + OFFSET within 16 bits. */
 static inline int32_t tanh_of(int32_t z) {
-    const int16_t *const at = tanh_table + 128 + (z >> 8);
+    const int16_t *const at = tanh_table + ((z + 32768 - OFFSET) >> 8);
     const int32_t low = at[0];
     return low + (((at[1] - low) * (z & 255) + 128) >> 8);
 }
@@ -499,7 +500,7 @@ static void dense(const struct layer *l, const activation *x, activation *y) {
         }
 #if TANH
         for (int i = 0; l->hidden && i < 4; ++i) {
-            y[i] = (activation)(tanh_of((int32_t)y[i] - OFFSET) + OFFSET);
+            y[i] = (activation)(tanh_of(y[i]) + OFFSET);
         }
 #endif
     }
@@ -520,31 +521,28 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 #if UNITS
 
-static inline int32_t tanh_of_sum(int32_t sum, int shift) {
-    return tanh_of(limited(sum * (1 << shift), -32768, 32767));
-}
-
 /* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
-static inline int32_t sigmoid(activation i, activation m) {
-    return (tanh_of_sum((int32_t)i - OFFSET + (int32_t)m - OFFSET, GATE_SHIFT) + 32768) >> 1;
+static inline int32_t sigmoid(activation z) {
+    return (tanh_of(z) + 32768) >> 1;
 }
 
-/* A gated recurrent unit of two layers, i of the inputs x in `a` and m of its own numbers h, which then take the place
-   of x; `i` is overwritten. r = sigmoid(i + m), z = sigmoid(i + m), n = tanh(i + r * m), h = n + (h - n) * z */
-static void remember(const struct layer *l, union activations *a, union activations *i, int16_t h[UNITS]) {
-    union activations m;
-    dense(l, a->one, i->one);
-    for (int k = 0; k < (UNITS + 3) / 4 * 4; ++k) {
-        a->one[k] = (activation)((k < UNITS ? h[k] : 0) + OFFSET);
+/* A gated recurrent unit of three layers: the gates of the inputs x in `a` and of its own numbers, g; i of x, and m of g. The
+   next numbers h take the place of x. r, z = sigmoid(gates), n = tanh(i + r * m), h = n + (h - n) * z */
+static void remember(const struct layer *l, activation *a, activation *y, int16_t h[UNITS]) {
+    activation *const g = a + MEMORY_AT;
+    const activation *const i = y + INPUT_AT, *const m = i + PADDED_UNITS;
+    for (int k = 0; k < PADDED_UNITS; ++k) {
+        g[k] = (activation)((k < UNITS ? shifted(h[k], MEMORY_SHIFT) : 0) + OFFSET);
     }
-    dense(l + 1, a->one, m.one);
+    dense(l, a, y);
+    dense(l + 1, a, y + INPUT_AT);
+    dense(l + 2, g, y + INPUT_AT + PADDED_UNITS);
     for (int k = 0; k < UNITS; ++k) {
-        const activation *const ik = i->one + k, *const mk = m.one + k;
-        const int32_t r = sigmoid(ik[0], mk[0]), z = sigmoid(ik[UNITS], mk[UNITS]);
-        const int32_t more = shifted(r * ((int32_t)mk[2 * UNITS] - OFFSET), 15);
-        const int32_t n = tanh_of_sum((int32_t)ik[2 * UNITS] - OFFSET + more, CANDIDATE_SHIFT);
+        const int32_t r = sigmoid(y[k]), z = sigmoid(y[k + UNITS]);
+        const int32_t sum = (int32_t)i[k] - OFFSET + shifted(r * ((int32_t)m[k] - OFFSET), 15);
+        const int32_t n = tanh_of(limited(sum * (1 << CANDIDATE_SHIFT), -32768, 32767) + OFFSET);
         h[k] = (int16_t)(n + shifted((h[k] - n) * z, 15));
-        a->one[k] = (activation)(h[k] + OFFSET);
+        a[k] = (activation)(h[k] + OFFSET);
     }
 }
 
@@ -555,8 +553,8 @@ static const activation *network(union activations *a, union activations *b, @na
     for (const struct layer *l = layers; l != layers + LAYERS; ++l) {
 #if UNITS
         if (l == layers + UNIT_LAYER) {
-            remember(l, a, b, state->recurrent);
-            l += 2;
+            remember(l, a->one, b->one, state->recurrent);
+            l += 3;
         }
 #endif
         dense(l, a->one, b->one);
