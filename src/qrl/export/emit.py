@@ -278,7 +278,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         _array(f"int16_t act_most[{prefix}_ACT_SIZE]", kernel.act_max, 12),
     ]
     if kernel.activation == "tanh" or kernel.unit:
-        parts.append(_array("int16_t tanh_table[257]", reference.tanh_table(), 16))
+        parts.append(_array("uint16_t tanh_table[257]", reference.tanh_table() + 2**15, 16))
     if memory := kernel.memory:
         parts += _memory_tables(memory, prefix)
         if memory.integral:

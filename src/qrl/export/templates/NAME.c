@@ -53,6 +53,7 @@ typedef int32_t accumulator;
 
 #ifdef BODY_DSP /* pairs of halfwords */
 typedef uint32_t factors;
+typedef int32_t __attribute__((may_alias)) pair;
 #define M2(m0, m1) (m0##u | m1##u << 16)
 #define FOUR 2
 #else
@@ -116,7 +117,7 @@ typedef uint16_t factors;
 
 union activations {
     activation one[WIDEST];
-    int32_t two[WIDEST / 2]; /* pairs, aligned */
+    int32_t aligned;
 };
 
 /* Of four outputs. */
@@ -351,9 +352,9 @@ static inline int32_t rectified(int32_t z) {
 
 #if TANH || UNITS
 
-/* tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; of z + OFFSET within 16 bits. */
+/* 2^15 plus tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; of z + OFFSET within 16 bits. */
 static inline int32_t tanh_of(int32_t z) {
-    const int16_t *const at = tanh_table + ((z + 32768 - OFFSET) >> 8);
+    const uint16_t *const at = tanh_table + ((z + 32768 - OFFSET) >> 8);
     const int32_t low = at[0];
     return low + (((at[1] - low) * (z & 255) + 128) >> 8);
 }
@@ -397,7 +398,7 @@ static inline int32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t f
 }
 
 static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
-    int32_t *const two = (void *)y;
+    pair *const two = (void *)y;
     two[0] = two_outputs(s->a0, s->a1, factor[0], shift, relu);
     two[1] = two_outputs(s->a2, s->a3, factor[1], shift, relu);
 }
@@ -500,7 +501,7 @@ static void dense(const struct layer *l, const activation *x, activation *y) {
         }
 #if TANH
         for (int i = 0; l->hidden && i < 4; ++i) {
-            y[i] = (activation)(tanh_of(y[i]) + OFFSET);
+            y[i] = (activation)(tanh_of(y[i]) - 32768 + OFFSET);
         }
 #endif
     }
@@ -523,7 +524,7 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 /* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
 static inline int32_t sigmoid(activation z) {
-    return (tanh_of(z) + 32768) >> 1;
+    return tanh_of(z) >> 1;
 }
 
 /* A gated recurrent unit of three layers: the gates of the inputs x in `a` and of its own numbers, g; i of x, and m of g. The
@@ -539,8 +540,11 @@ static void remember(const struct layer *l, activation *a, activation *y, int16_
     dense(l + 2, g, y + INPUT_AT + PADDED_UNITS);
     for (int k = 0; k < UNITS; ++k) {
         const int32_t r = sigmoid(y[k]), z = sigmoid(y[k + UNITS]);
-        const int32_t sum = (int32_t)i[k] - OFFSET + shifted(r * ((int32_t)m[k] - OFFSET), 15);
-        const int32_t n = tanh_of(limited(sum * (1 << CANDIDATE_SHIFT), -32768, 32767) + OFFSET);
+        int32_t sum = ((int32_t)i[k] - OFFSET + shifted(r * ((int32_t)m[k] - OFFSET), 15)) * (1 << CANDIDATE_SHIFT);
+        if (((uint32_t)sum + 32768u) >> 16) { /* rarely */
+            sum = sum < 0 ? -32768 : 32767;
+        }
+        const int32_t n = tanh_of(sum + OFFSET) - 32768;
         h[k] = (int16_t)(n + shifted((h[k] - n) * z, 15));
         a[k] = (activation)(h[k] + OFFSET);
     }
@@ -571,12 +575,12 @@ static int16_t action(activation y, int i) {
     return (int16_t)(z < act_least[i] ? act_least[i] : z > act_most[i] ? act_most[i] : z);
 }
 
-/* Store one input, saturated; returns 1 if saturation changed it. */
-static int put(union activations *x, int i, int32_t q) {
+/* Store one input, saturated; returns 0 unless saturation changed it. */
+static inline int put(union activations *x, int i, int32_t q) {
     const int32_t least = inputs[i].least, most = inputs[i].most;
     const int32_t within = q > most ? most : q < least ? least : q;
     x->one[i] = (activation)(within + OFFSET);
-    return within != q;
+    return within ^ q;
 }
 
 #if INTEGRAL
@@ -622,14 +626,13 @@ static void integrate(int32_t integral[INTEGRAL], union activations *x) {
 
 #if TURN
 
-/* A vector of the world in the body frame. */
+/* A vector of the world in the body frame, of three numbers or, if it is horizontal, of two. */
 static void rotated(activation y[3], const int32_t r[9], const activation v[], int numbers, int shift) {
+    const int32_t v0 = (int32_t)v[0] - OFFSET, v1 = (int32_t)v[1] - OFFSET, v2 = numbers > 2 ? (int32_t)v[2] - OFFSET : 0;
+    const int32_t half = (int32_t)1 << shift >> 1;
     for (int j = 0; j < 3; ++j) {
-        int32_t sum = 0;
-        for (int i = 0; i < numbers; ++i) {
-            sum += (r[3 * i + j] * ((int32_t)v[i] - OFFSET)) >> 1;
-        }
-        y[j] = (activation)(limited(shifted(sum, shift), -32767, 32767) + OFFSET);
+        const int32_t sum = (r[j] * v0 >> 1) + (r[3 + j] * v1 >> 1) + (r[6 + j] * v2 >> 1);
+        y[j] = (activation)(limited((sum + half) >> shift, -32767, 32767) + OFFSET);
     }
 }
 
@@ -753,7 +756,7 @@ int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act
 #endif
         act[i] = (float)steps * act_lsb[i];
     }
-    return status;
+    return status != 0;
 }
 
 int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int16_t act[@NAME@_ACT_SIZE]) {
@@ -770,7 +773,7 @@ int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int
         state->previous_action[i] = act[i];
 #endif
     }
-    return status;
+    return status != 0;
 }
 
 #if MEMORY
