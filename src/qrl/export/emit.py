@@ -267,8 +267,8 @@ def _layers(kernel: Kernel) -> list[_Layer]:
 
 def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
     layers = _layers(kernel)
-    columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max
-    inputs = (f"{{{s}u, {e}, {low}, {high}}}" for s, e, low, high in zip(*columns, strict=True))
+    columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max - kernel.obs_min
+    inputs = (f"{{{s}u, {e}, {low}, {span}u}}" for s, e, low, span in zip(*columns, strict=True))
     parts = [
         f"#define LAYERS {len(layers)}\n#define PADDED_INPUTS {layers[0].shape[1]}\n#define GOLDENS {embedded(kernel)}",
         _array(f"struct input inputs[{prefix}_OBS_SIZE]", inputs, 6),

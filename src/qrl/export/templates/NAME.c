@@ -137,8 +137,8 @@ struct layer {
 struct input {
     uint16_t scale;
     int16_t exponent; /* 1 / lsb = scale * 2^(142 - exponent) */
-    int16_t least;    /* in steps; inputs saturate at least and most */
-    int16_t most;
+    int16_t least;    /* in steps; inputs saturate at least and at least + span */
+    uint16_t span;
 };
 
 struct golden {
@@ -218,21 +218,24 @@ struct four {
     "smlad  %[" upper "], %[" word "], %[" in "], %[" upper "]\n\t" \
     "sxtb16 %[" word "], %[" word "], ror #8\n\t"                \
     "smlad  %[" lower "], %[" word "], %[" in "], %[" lower "]\n\t"
+#define FOUR_INPUTS                                                                                        \
+    "ldrd   %[x0], %[x1], [%[x]], #8\n\t"                                                                  \
+    "ldrd   %[w0], %[w1], [%[w]], #8\n\t" WORD("w0", "x0", "a0", "a1") WORD("w1", "x1", "a0", "a1")        \
+    "ldrd   %[w0], %[w1], [%[w]], #8\n\t" WORD("w0", "x0", "a2", "a3") WORD("w1", "x1", "a2", "a3")
 
 static inline const weight *accumulate(struct four *s, const accumulator *biases, const weight *w, const activation *x,
                                        const activation *last) {
     accumulator a0 = biases[0], a1 = biases[1], a2 = biases[2], a3 = biases[3];
     uint32_t w0, w1, x0, x1;
     __asm__ volatile(
-        "1:\n\t"
-        "ldrd   %[x0], %[x1], [%[x]], #8\n\t"
-        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" WORD("w0", "x0", "a0", "a1") WORD("w1", "x1", "a0", "a1")
-        "ldrd   %[w0], %[w1], [%[w]], #8\n\t" WORD("w0", "x0", "a2", "a3") WORD("w1", "x1", "a2", "a3")
+        "tst    %[fours], #1\n\t"
+        "bne    2f\n" /* an odd number of fours: from the middle */
+        "1:\n\t" FOUR_INPUTS "2:\n\t" FOUR_INPUTS
         "cmp    %[x], %[last]\n\t"
         "bne    1b"
         : [a0] "+r"(a0), [a1] "+r"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+r"(w), [x] "+r"(x), [w0] "=&r"(w0),
           [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1)
-        : [last] "r"(last)
+        : [last] "r"(last), [fours] "r"((last - x) / 4)
         : "cc", "memory");
     s->a0 = a0 - (a1 << 8), s->a1 = a1, s->a2 = a2 - (a3 << 8), s->a3 = a3;
     return w;
@@ -352,11 +355,16 @@ static inline int32_t rectified(int32_t z) {
 
 #if TANH || UNITS
 
-/* 2^15 plus tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; of z + OFFSET within 16 bits. */
-static inline int32_t tanh_of(int32_t z) {
-    const uint16_t *const at = tanh_table + ((z + 32768 - OFFSET) >> 8);
+/* 2^15 plus tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; u is z + 2^15, of 16 bits. */
+static inline int32_t tanh_of(uint32_t u) {
+    const uint16_t *const at = tanh_table + (u >> 8);
     const int32_t low = at[0];
-    return low + (((at[1] - low) * (z & 255) + 128) >> 8);
+    return low + (((at[1] - low) * (int32_t)(u & 255) + 128) >> 8);
+}
+
+/* An activation plus 2^15. */
+static inline uint32_t above(activation z) {
+    return (uint32_t)((int32_t)z + 32768 - OFFSET);
 }
 
 #endif
@@ -483,7 +491,7 @@ static void dense(const struct layer *l, const activation *x, activation *y) {
 #if defined(BODY_DSP) || defined(BODY_ARMV6M)
     const accumulator shared = sum_of(x, last);
 #endif
-    for (const struct outputs *o = l->outputs; o != l->end; ++o, y += 4) {
+    for (const struct outputs *o = l->outputs, *const end = l->end; o != end; ++o, y += 4) {
         struct four s;
         w = accumulate(&s, o->biases, w, x, last);
 #if defined(BODY_ARMV6M)
@@ -501,7 +509,7 @@ static void dense(const struct layer *l, const activation *x, activation *y) {
         }
 #if TANH
         for (int i = 0; l->hidden && i < 4; ++i) {
-            y[i] = (activation)(tanh_of(y[i]) - 32768 + OFFSET);
+            y[i] = (activation)(tanh_of(above(y[i])) - 32768 + OFFSET);
         }
 #endif
     }
@@ -524,7 +532,7 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 /* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
 static inline int32_t sigmoid(activation z) {
-    return tanh_of(z) >> 1;
+    return tanh_of(above(z)) >> 1;
 }
 
 /* A gated recurrent unit of three layers: the gates of the inputs x in `a` and of its own numbers, g; i of x, and m of g. The
@@ -540,11 +548,12 @@ static void remember(const struct layer *l, activation *a, activation *y, int16_
     dense(l + 2, g, y + INPUT_AT + PADDED_UNITS);
     for (int k = 0; k < UNITS; ++k) {
         const int32_t r = sigmoid(y[k]), z = sigmoid(y[k + UNITS]);
-        int32_t sum = ((int32_t)i[k] - OFFSET + shifted(r * ((int32_t)m[k] - OFFSET), 15)) * (1 << CANDIDATE_SHIFT);
-        if (((uint32_t)sum + 32768u) >> 16) { /* rarely */
-            sum = sum < 0 ? -32768 : 32767;
+        const int32_t more = shifted(r * (int32_t)m[k], 15) - (OFFSET ? r : 0); /* r * m, m without its offset */
+        int32_t u = ((int32_t)i[k] + more) * (1 << CANDIDATE_SHIFT) + 32768 - OFFSET * (1 << CANDIDATE_SHIFT);
+        if ((uint32_t)u >> 16) { /* rarely */
+            u = u < 0 ? 0 : 65535;
         }
-        const int32_t n = tanh_of(sum + OFFSET) - 32768;
+        const int32_t n = tanh_of((uint32_t)u) - 32768;
         h[k] = (int16_t)(n + shifted((h[k] - n) * z, 15));
         a[k] = (activation)(h[k] + OFFSET);
     }
@@ -575,12 +584,16 @@ static int16_t action(activation y, int i) {
     return (int16_t)(z < act_least[i] ? act_least[i] : z > act_most[i] ? act_most[i] : z);
 }
 
-/* Store one input, saturated; returns 0 unless saturation changed it. */
-static inline int put(union activations *x, int i, int32_t q) {
-    const int32_t least = inputs[i].least, most = inputs[i].most;
-    const int32_t within = q > most ? most : q < least ? least : q;
-    x->one[i] = (activation)(within + OFFSET);
-    return within ^ q;
+/* Store one input, saturated, which is rare; returns 1 if saturation changed it. */
+static inline int put(activation *x, const struct input *in, int32_t q) {
+    const int32_t least = in->least;
+    int clipped = 0;
+    if ((uint32_t)(q - least) > in->span) {
+        q = q < least ? least : least + in->span;
+        clipped = 1;
+    }
+    *x = (activation)(q + OFFSET);
+    return clipped;
 }
 
 #if INTEGRAL
@@ -745,7 +758,7 @@ int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act
             }
             return 2;
         }
-        status |= put(&a, i, quantised(in.bits, &inputs[i]));
+        status |= put(a.one + i, inputs + i, quantised(in.bits, inputs + i));
     }
     complete(&a, state);
     const activation *const y = network(&a, &b, state);
@@ -756,14 +769,14 @@ int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act
 #endif
         act[i] = (float)steps * act_lsb[i];
     }
-    return status != 0;
+    return status;
 }
 
 int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int16_t act[@NAME@_ACT_SIZE]) {
     union activations a, b;
     int status = 0;
     for (int i = 0; i < @NAME@_OBS_SIZE; ++i) {
-        status |= put(&a, i, obs[i]);
+        status |= put(a.one + i, inputs + i, obs[i]);
     }
     complete(&a, state);
     const activation *const y = network(&a, &b, state);
@@ -773,7 +786,7 @@ int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int
         state->previous_action[i] = act[i];
 #endif
     }
-    return status != 0;
+    return status;
 }
 
 #if MEMORY
