@@ -267,7 +267,7 @@ def _layers(kernel: Kernel) -> list[_Layer]:
 
 def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
     layers = _layers(kernel)
-    columns = kernel.scale, kernel.exponent, kernel.obs_min, kernel.obs_max - kernel.obs_min
+    columns = kernel.scale, kernel.exponent - 1, kernel.obs_min, kernel.obs_max - kernel.obs_min
     inputs = (f"{{{s}u, {e}, {low}, {span}u}}" for s, e, low, span in zip(*columns, strict=True))
     parts = [
         f"#define LAYERS {len(layers)}\n#define PADDED_INPUTS {layers[0].shape[1]}\n#define GOLDENS {embedded(kernel)}",

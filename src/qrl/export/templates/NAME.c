@@ -136,7 +136,7 @@ struct layer {
 
 struct input {
     uint16_t scale;
-    int16_t exponent; /* 1 / lsb = scale * 2^(142 - exponent) */
+    int16_t exponent; /* 1 / lsb = scale * 2^(141 - exponent) */
     int16_t least;    /* in steps; inputs saturate at least and at least + span */
     uint16_t span;
 };
@@ -181,6 +181,7 @@ struct error {
 #if defined(BODY_MVE)
 
 struct four {
+    accumulator shared;
     int32x4_t sums;
 };
 
@@ -208,7 +209,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 #else
 
 struct four {
-    accumulator a0, a1, a2, a3;
+    accumulator shared, a0, a1, a2, a3;
 };
 
 #if defined(BODY_DSP)
@@ -227,22 +228,27 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
                                        const activation *last) {
     accumulator a0 = biases[0], a1 = biases[1], a2 = biases[2], a3 = biases[3];
     uint32_t w0, w1, x0, x1;
+    int fours = (int)(last - x) / 4;
     __asm__ volatile(
         "tst    %[fours], #1\n\t"
         "bne    2f\n" /* an odd number of fours: from the middle */
         "1:\n\t" FOUR_INPUTS "2:\n\t" FOUR_INPUTS
-        "cmp    %[x], %[last]\n\t"
-        "bne    1b"
+        "subs   %[fours], #2\n\t"
+        "bgt    1b\n\t"
+        "sub    %[a0], %[a0], %[a1], lsl #8\n\t"
+        "sub    %[a2], %[a2], %[a3], lsl #8\n\t"
+        "sub    %[a0], %[a0], %[shared]\n\t"
+        "sub    %[a2], %[a2], %[shared]"
         : [a0] "+r"(a0), [a1] "+r"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+r"(w), [x] "+r"(x), [w0] "=&r"(w0),
-          [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1)
-        : [last] "r"(last), [fours] "r"((last - x) / 4)
+          [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1), [fours] "+r"(fours)
+        : [shared] "r"(s->shared)
         : "cc", "memory");
-    s->a0 = a0 - (a1 << 8), s->a1 = a1, s->a2 = a2 - (a3 << 8), s->a3 = a3;
+    s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
     return w;
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-static inline accumulator sum_of(const activation *x, const activation *last) {
+static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     uint32_t x0, x1;
     __asm__ volatile(
@@ -296,7 +302,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-static inline accumulator sum_of(const activation *x, const activation *last) {
+static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     for (; x != last; x += 4) {
         sum += (accumulator)x[0] + x[1] + x[2] + x[3];
@@ -324,6 +330,16 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 #endif
+#endif
+
+#if defined(BODY_MVE) || !(defined(BODY_DSP) || defined(BODY_ARMV6M))
+
+/* Weights as they are need no sum. */
+static inline accumulator sum_of(const activation *x, const activation *last) {
+    (void)x, (void)last;
+    return 0;
+}
+
 #endif
 
 #if !(defined(BODY_MVE) || defined(BODY_ARMV6M))
@@ -355,16 +371,11 @@ static inline int32_t rectified(int32_t z) {
 
 #if TANH || UNITS
 
-/* 2^15 plus tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; u is z + 2^15, of 16 bits. */
-static inline int32_t tanh_of(uint32_t u) {
-    const uint16_t *const at = tanh_table + (u >> 8);
+/* 2^15 plus tanh of z * 6 / 2^15, interpolated linearly in a table with an entry every 2^8; of z + OFFSET. */
+static inline int32_t tanh_of(int32_t z) {
+    const uint16_t *const at = tanh_table + (OFFSET ? 0 : 128) + (z >> 8);
     const int32_t low = at[0];
-    return low + (((at[1] - low) * (int32_t)(u & 255) + 128) >> 8);
-}
-
-/* An activation plus 2^15. */
-static inline uint32_t above(activation z) {
-    return (uint32_t)((int32_t)z + 32768 - OFFSET);
+    return low + (((at[1] - low) * (z & 255) + 128) >> 8);
 }
 
 #endif
@@ -429,7 +440,7 @@ static inline void four_outputs(activation *y, const struct four *s, const facto
     "lsls %[t], %[t], #8\n\t"                                                                         \
     "subs %[a0], %[a0], %[t]\n\t"
 #define SHARED "subs %[a0], %[a0], %[shared]\n\t"
-#define FOUR_OUTPUTS(s, y, factor, shift, shared, saturate)                                           \
+#define FOUR_OUTPUTS(s, y, factor, shift, saturate)                                           \
     do {                                                                                              \
         accumulator a0 = (s)->a0;                                                                     \
         uint32_t t, u;                                                                                \
@@ -439,14 +450,13 @@ static inline void four_outputs(activation *y, const struct four *s, const facto
                                      NEXT("a3") SHARED OUTPUT("6", saturate)                          \
                          : [a0] "+l"(a0), [t] "=&l"(t), [u] "=&l"(u)                                  \
                          : [a1] "h"((s)->a1), [a2] "h"((s)->a2), [a3] "h"((s)->a3), [f] "l"(factor), [y] "l"(y), \
-                           [shift] "l"(shift), [shared] "l"(shared), [offset] "h"(OFFSET)             \
+                           [shift] "l"(shift), [shared] "l"((s)->shared), [offset] "h"(OFFSET)             \
                          : "cc", "memory");                                                           \
     } while (0)
 
-static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu,
-                                accumulator shared) {
+static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
     if (relu) {
-        FOUR_OUTPUTS(s, y, factor, shift, shared,
+        FOUR_OUTPUTS(s, y, factor, shift,
                      "asrs %[t], %[a0], #31\n\t"
                      "bics %[a0], %[a0], %[t]\n\t"
                      "lsrs %[t], %[a0], #15\n\t"
@@ -457,7 +467,7 @@ static inline void four_outputs(activation *y, const struct four *s, const facto
                      "1:\n\t"
                      "add  %[a0], %[offset]\n\t");
     } else {
-        FOUR_OUTPUTS(s, y, factor, shift, shared,
+        FOUR_OUTPUTS(s, y, factor, shift,
                      "add  %[a0], %[offset]\n\t"
                      "lsrs %[t], %[a0], #16\n\t"
                      "beq  1f\n\t"
@@ -483,33 +493,22 @@ static inline void four_outputs(activation *y, const struct four *s, const facto
 
 #endif
 
-/* One layer, four outputs at a time; x and y are aligned to pairs. */
-static void dense(const struct layer *l, const activation *x, activation *y) {
+/* One layer, four outputs at a time; x, whose sum is `shared`, and y are aligned to pairs. */
+static void dense(const struct layer *l, const activation *x, accumulator shared, activation *y) {
     const activation *const last = x + l->inputs;
     const weight *w = l->weights;
     const int shift = l->shift, relu = l->hidden && !TANH;
-#if defined(BODY_DSP) || defined(BODY_ARMV6M)
-    const accumulator shared = sum_of(x, last);
-#endif
     for (const struct outputs *o = l->outputs, *const end = l->end; o != end; ++o, y += 4) {
-        struct four s;
+        struct four s = {.shared = shared};
         w = accumulate(&s, o->biases, w, x, last);
-#if defined(BODY_ARMV6M)
-#define SHARING , shared
-#else
-#define SHARING
-#endif
-#if defined(BODY_DSP)
-        s.a0 -= shared, s.a2 -= shared;
-#endif
         if (relu) {
-            four_outputs(y, &s, o->factors, shift, 1 SHARING);
+            four_outputs(y, &s, o->factors, shift, 1);
         } else {
-            four_outputs(y, &s, o->factors, shift, 0 SHARING);
+            four_outputs(y, &s, o->factors, shift, 0);
         }
 #if TANH
         for (int i = 0; l->hidden && i < 4; ++i) {
-            y[i] = (activation)(tanh_of(above(y[i])) - 32768 + OFFSET);
+            y[i] = (activation)(tanh_of(y[i]) - 32768 + OFFSET);
         }
 #endif
     }
@@ -532,7 +531,7 @@ static inline int32_t shifted(int32_t x, int shift) {
 
 /* A sigmoid in 1 / 2^15: (1 + tanh of half of its argument) / 2, of the half. */
 static inline int32_t sigmoid(activation z) {
-    return tanh_of(above(z)) >> 1;
+    return tanh_of(z) >> 1;
 }
 
 /* A gated recurrent unit of three layers: the gates of the inputs x in `a` and of its own numbers, g; i of x, and m of g. The
@@ -543,19 +542,21 @@ static void remember(const struct layer *l, activation *a, activation *y, int16_
     for (int k = 0; k < PADDED_UNITS; ++k) {
         g[k] = (activation)((k < UNITS ? shifted(h[k], MEMORY_SHIFT) : 0) + OFFSET);
     }
-    dense(l, a, y);
-    dense(l + 1, a, y + INPUT_AT);
-    dense(l + 2, g, y + INPUT_AT + PADDED_UNITS);
+    const accumulator of_x = sum_of(a, a + l[1].inputs), of_g = sum_of(g, g + PADDED_UNITS);
+    dense(l, a, of_x + of_g, y);
+    dense(l + 1, a, of_x, y + INPUT_AT);
+    dense(l + 2, g, of_g, y + INPUT_AT + PADDED_UNITS);
     for (int k = 0; k < UNITS; ++k) {
         const int32_t r = sigmoid(y[k]), z = sigmoid(y[k + UNITS]);
         const int32_t more = shifted(r * (int32_t)m[k], 15) - (OFFSET ? r : 0); /* r * m, m without its offset */
-        int32_t u = ((int32_t)i[k] + more) * (1 << CANDIDATE_SHIFT) + 32768 - OFFSET * (1 << CANDIDATE_SHIFT);
-        if ((uint32_t)u >> 16) { /* rarely */
-            u = u < 0 ? 0 : 65535;
+        int32_t sum = ((int32_t)i[k] + more) * (1 << CANDIDATE_SHIFT) + OFFSET - OFFSET * (1 << CANDIDATE_SHIFT);
+        if (((uint32_t)sum + 32768u - OFFSET) >> 16) { /* rarely */
+            sum = (sum < 0 ? -32768 : 32767) + OFFSET;
         }
-        const int32_t n = tanh_of((uint32_t)u) - 32768;
-        h[k] = (int16_t)(n + shifted((h[k] - n) * z, 15));
-        a[k] = (activation)(h[k] + OFFSET);
+        const int32_t n = tanh_of(sum) - 32768;
+        const int32_t next = n + shifted((h[k] - n) * z, 15);
+        h[k] = (int16_t)next;
+        a[k] = (activation)(next + OFFSET);
     }
 }
 
@@ -570,7 +571,7 @@ static const activation *network(union activations *a, union activations *b, @na
             l += 3;
         }
 #endif
-        dense(l, a->one, b->one);
+        dense(l, a->one, sum_of(a->one, a->one + l->inputs), b->one);
         union activations *const swapped = a;
         a = b;
         b = swapped;
@@ -587,13 +588,12 @@ static int16_t action(activation y, int i) {
 /* Store one input, saturated, which is rare; returns 1 if saturation changed it. */
 static inline int put(activation *x, const struct input *in, int32_t q) {
     const int32_t least = in->least;
-    int clipped = 0;
     if ((uint32_t)(q - least) > in->span) {
-        q = q < least ? least : least + in->span;
-        clipped = 1;
+        *x = (activation)((q < least ? least : least + in->span) + OFFSET);
+        return 1;
     }
     *x = (activation)(q + OFFSET);
-    return clipped;
+    return 0;
 }
 
 #if INTEGRAL
@@ -656,7 +656,12 @@ static void turn(union activations *x, int32_t r[9]) {
     for (int i = 0; i < 9; ++i) {
         r[i] = (int32_t)x->one[i] - OFFSET;
     }
-    for (int i = HEADING ? 0 : 6; i < 9; i += i == 2 ? 4 : 1) {
+#if HEADING
+    for (int i = 0; i < 3; ++i) {
+        *to++ = (activation)(shifted(r[i], UP_SHIFT) + OFFSET);
+    }
+#endif
+    for (int i = 6; i < 9; ++i) {
         *to++ = (activation)(shifted(r[i], UP_SHIFT) + OFFSET);
     }
     rotated(to, r, x->one + 9, 3, POSITION_SHIFT);
@@ -711,15 +716,15 @@ static void complete(union activations *x, @name@_state *state) {
     }
 }
 
-/* Round x / lsb to an integer, x given by the bits of a finite float; a result beyond 32767 is inexact, but beyond 32767.
-   In integers only: independent of compiler flags, and without a floating-point library. */
-static int32_t quantised(uint32_t bits, const struct input *in) {
-    const int32_t right = in->exponent - (int32_t)(bits >> 23 & 255u);
-    if (right > 32) {
+/* Round x / lsb to an integer, x given by the bits of a finite float and their exponent; a result beyond 32767 is inexact,
+   but beyond 32767. In integers only: independent of compiler flags, and without a floating-point library. */
+static inline int32_t quantised(uint32_t bits, int32_t exponent, const struct input *in) {
+    const int32_t shift = in->exponent - exponent;
+    if (shift > 31) {
         return 0; /* below half an lsb */
     }
     const uint32_t product = ((bits & 0x7fffffu) | 0x800000u) / 256u * in->scale; /* at least 2^30 */
-    const int32_t size = (int32_t)(((product >> (right < 15 ? 14 : right - 1)) + 1u) / 2u);
+    const int32_t size = (int32_t)(((product >> (shift < 14 ? 14 : shift)) + 1u) / 2u);
     return bits >> 31 ? -size : size;
 }
 
@@ -752,13 +757,14 @@ int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act
             float real;
             uint32_t bits;
         } in = {obs[i]};
-        if ((in.bits & 0x7f800000u) == 0x7f800000u) { /* by its bits: -ffast-math assumes that no float is NaN */
+        const int32_t exponent = in.bits >> 23 & 255;
+        if (exponent == 255) { /* infinite or not a number, by its bits: -ffast-math assumes that no float is NaN */
             for (int j = 0; j < @NAME@_ACT_SIZE; ++j) {
                 act[j] = act_safe[j];
             }
             return 2;
         }
-        status |= put(a.one + i, inputs + i, quantised(in.bits, inputs + i));
+        status |= put(a.one + i, inputs + i, quantised(in.bits, exponent, inputs + i));
     }
     complete(&a, state);
     const activation *const y = network(&a, &b, state);
