@@ -154,6 +154,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "seen": str(len(reference.measured(kernel, kernel.obs_max[None])[0])),
         "turn": str(int(kernel.turn is not None)),
         "kept": str(len(kernel.memory.shift) if kernel.memory else 0),
+        "goldens": str(embedded(kernel)),
         "units": str(kernel.memory.units if kernel.memory else 0),
         "banner": "\n".join(_comment_safe(line) for line in banner),
         "task": _comment_safe(run.task),
@@ -178,7 +179,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
         "widest": str(_widest(kernel)),
         "tanh": str(int(kernel.activation == "tanh")),
-        "tables": _tables(kernel, golden, name.upper()),
+        "tables": _tables(kernel, golden, name),
     }
 
 
@@ -265,12 +266,13 @@ def _layers(kernel: Kernel) -> list[_Layer]:
     return found
 
 
-def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
+def _tables(kernel: Kernel, golden: Vectors, name: str) -> str:
+    prefix = name.upper()
     layers = _layers(kernel)
     columns = kernel.scale, kernel.exponent - 1, kernel.obs_min, kernel.obs_max - kernel.obs_min
     inputs = (f"{{{s}u, {e}, {low}, {span}u}}" for s, e, low, span in zip(*columns, strict=True))
     parts = [
-        f"#define LAYERS {len(layers)}\n#define PADDED_INPUTS {layers[0].shape[1]}\n#define GOLDENS {embedded(kernel)}",
+        f"#define LAYERS {len(layers)}\n#define PADDED_INPUTS {layers[0].shape[1]}",
         _array(f"struct input inputs[{prefix}_OBS_SIZE]", inputs, 6),
         _array(f"float act_lsb[{prefix}_ACT_SIZE]", map(_float, kernel.act_lsb), 4),
         _array(f"float act_safe[{prefix}_ACT_SIZE]", map(_float, kernel.act_safe), 4),
@@ -282,7 +284,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
     if memory := kernel.memory:
         parts += _memory_tables(memory, prefix)
         if memory.integral:
-            parts += _integral_tables(memory.integral, kernel.obs_shift, golden, embedded(kernel))
+            parts += _integral_tables(memory.integral, kernel.obs_shift)
     if units := kernel.memory.units if kernel.memory else 0:
         assert kernel.unit
         numbers = {"UNIT_LAYER": len(kernel.layers) - 1}
@@ -290,8 +292,6 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         given = _padded(kernel.unit.of_input.weight.shape[1])
         numbers |= {"MEMORY_AT": f"TILES({given})", "INPUT_AT": _padded(2 * units), "PADDED_UNITS": _padded(units)}
         parts.append("\n".join(f"#define {name} {value}" for name, value in numbers.items()))
-        last = np.ascontiguousarray(golden.outputs.state[embedded(kernel) - 1, -2 * units :]).view("<i2")
-        parts.append(_array("int16_t golden_recurrent[UNITS]", last, 12))
     if turn := kernel.turn:
         shifts = {"UP": turn.up, "POSITION": turn.position, "VELOCITY": turn.velocity, "AHEAD": turn.ahead}
         numbers = {"HEADING": int(turn.heading), "VECTORS": turn.vectors, "LAST": turn.last}
@@ -304,7 +304,7 @@ def _tables(kernel: Kernel, golden: Vectors, prefix: str) -> str:
         for i, layer in enumerate(layers)
     )
     parts.append(_array("struct layer layers[LAYERS]", rows, 1))
-    parts.append(_array("struct golden goldens[GOLDENS]", _golden_rows(golden, embedded(kernel)), 1))
+    parts += _golden_tables(kernel, golden, embedded(kernel), name)
     return "\n\n".join(parts)
 
 
@@ -316,8 +316,7 @@ def _memory_tables(memory: Memory, prefix: str) -> list[str]:
     return parts
 
 
-def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, goldens: int) -> list[str]:
-    """`golden`: its states are at the end of the embedded vectors."""
+def _integral_tables(integral: Integral, obs_shift: Ints) -> list[str]:
     columns = integral.inverse_radius, integral.gain, integral.inverse_radius_shift, integral.gain_shift
     errors = (f"{{{', '.join(map(str, numbers))}}}" for numbers in zip(*columns, strict=True))
     positions = (f"{{{at}, {obs_shift[at]}}}" for at in integral.position)
@@ -329,10 +328,7 @@ def _integral_tables(integral: Integral, obs_shift: Ints, golden: Vectors, golde
     if circle := integral.circle:
         diameter = (f"{{{factor}, {shift}}}" for factor, shift in zip(circle.factor, circle.shift, strict=True))
         parts += ["#define CIRCLE 1", _array("struct factor diameter[2]", diameter, 2)]
-    return [
-        *parts,
-        _array("int32_t golden_integral[INTEGRAL]", _integrals(golden, integral)[goldens - 1], 3),
-    ]
+    return parts
 
 
 def _layer_tables(index: int, layer: _Layer) -> str:
@@ -378,11 +374,25 @@ def _integrals(golden: Vectors, integral: Integral) -> Ints:
     return np.ascontiguousarray(golden.outputs.state[:, : 4 * integral.size]).view("<i4")
 
 
-def _golden_rows(golden: Vectors, n: int) -> Iterable[str]:
+def _golden_tables(kernel: Kernel, golden: Vectors, n: int, name: str) -> list[str]:
+    """The first n vectors, and the state after them."""
+    rows = []
     for i in range(n):
         obs_i16, act = (", ".join(map(str, x[i])) for x in (golden.obs_i16, golden.outputs.act_i16))
         columns = f"{{{_floats(golden.obs[i])}}}", f"{{{obs_i16}}}", f"{{{act}}}"
-        yield f"{{{', '.join(columns)}, {golden.outputs.status[i]}, {golden.outputs.status_i16[i]}}}"
+        rows.append(f"{{{', '.join(columns)}, {golden.outputs.status[i]}, {golden.outputs.status_i16[i]}}}")
+    vectors = ["static const struct goldens goldens = {", "    {0x7fc00000u},", "    {", *_lines(rows, 1), "    },", "};"]
+    if kernel.memory is None:
+        return ["\n".join(vectors)]
+    state = np.ascontiguousarray(golden.outputs.state[n - 1])
+    first = 4 * kernel.memory.integral.size if kernel.memory.integral else 0
+    numbers = np.split(state[first:].view("<i2"), [kernel.memory.actions])
+    fields = [part.tolist() for part in (state[:first].view("<i4"), *numbers) if len(part)]
+    text = ", ".join(f"{{{', '.join(map(str, field))}}}" for field in fields)
+    return [
+        "\n".join(vectors),
+        f"#define STATE_BYTES {len(state)}\nstatic const {name}_state golden_state = {{{text}}};",
+    ]
 
 
 def _array(declaration: str, values: Iterable[Any], columns: int) -> str:

@@ -23,6 +23,12 @@
 #define BODY_ARMV6M
 #endif
 
+#if defined(BODY_DSP) || defined(BODY_ARMV6M) /* inlined, these are slower or larger */
+#define APART static __attribute__((noinline))
+#else
+#define APART static
+#endif
+
 #if defined(__ARM_FEATURE_SAT) && defined(__GNUC__)
 #define SATURATE
 #endif
@@ -51,9 +57,12 @@ typedef int8_t weight;
 typedef int32_t accumulator;
 #endif
 
+#if defined(BODY_DSP) || defined(BODY_ARMV6M)
+typedef uint32_t __attribute__((may_alias)) pair;
+#endif
+
 #ifdef BODY_DSP /* pairs of halfwords */
 typedef uint32_t factors;
-typedef int32_t __attribute__((may_alias)) pair;
 #define M2(m0, m1) (m0##u | m1##u << 16)
 #define FOUR 2
 #else
@@ -110,6 +119,7 @@ typedef uint16_t factors;
 #define SEEN @seen@ /* inputs of the network that follow from the observation */
 #define TURN @turn@ /* whether they are in the body frame */
 #define KEPT @kept@ /* inputs that are remembered */
+#define GOLDENS @goldens@
 
 /* So many inputs, in whole tiles. */
 #define TILES(inputs) (((inputs) + TILE - 1) / TILE * TILE)
@@ -146,6 +156,14 @@ struct golden {
     int16_t obs_i16[@NAME@_OBS_SIZE];
     int16_t act[@NAME@_ACT_SIZE];
     int8_t status, status_i16;
+};
+
+struct goldens {
+    union {
+        uint32_t bits;
+        float obs;
+    } not_a_number; /* the first of an observation's numbers, of which the others follow */
+    struct golden vectors[GOLDENS];
 };
 
 #if KEPT
@@ -248,7 +266,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
+APART accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     uint32_t x0, x1;
     __asm__ volatile(
@@ -302,7 +320,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
+APART accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     for (; x != last; x += 4) {
         sum += (accumulator)x[0] + x[1] + x[2] + x[3];
@@ -396,8 +414,8 @@ static inline int32_t scaled(int32_t x, uint32_t factor) {
 /* Four outputs from their sums, saturated to 16 bits, of a layer with `relu` to [0, 32767]. */
 #if defined(BODY_MVE)
 
-static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
-    const int32x4_t upper = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(factor)), 16);
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
+    const int32x4_t upper = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(o->factors)), 16);
     const int32x4_t z = vshlq_r_s32(vmulhq_s32(s->sums, upper), -shift);
     const int16x8_t within = vqmovnbq_s32(vdupq_n_s16(0), z);
     vstrhq_s32(y, vreinterpretq_s32_s16(relu ? vmaxq_s16(within, vdupq_n_s16(0)) : within));
@@ -406,8 +424,9 @@ static inline void four_outputs(activation *y, const struct four *s, const facto
 #elif defined(BODY_DSP)
 
 /* Two factors, and two outputs, in a word. */
-static inline int32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t factor, int shift, int relu) {
-    int32_t z0, z1, word;
+static inline uint32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t factor, int shift, int relu) {
+    int32_t z0, z1;
+    uint32_t word;
     __asm__("smulwb %0, %1, %2" : "=r"(z0) : "r"(acc0), "r"(factor));
     __asm__("smulwt %0, %1, %2" : "=r"(z1) : "r"(acc1), "r"(factor));
     z0 = relu ? rectified(z0 >> shift) : saturated(z0 >> shift);
@@ -416,64 +435,52 @@ static inline int32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t f
     return word;
 }
 
-static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
     pair *const two = (void *)y;
-    two[0] = two_outputs(s->a0, s->a1, factor[0], shift, relu);
-    two[1] = two_outputs(s->a2, s->a3, factor[1], shift, relu);
+    two[0] = two_outputs(s->a0, s->a1, o->factors[0], shift, relu);
+    two[1] = two_outputs(s->a2, s->a3, o->factors[1], shift, relu);
 }
 
 #elif defined(BODY_ARMV6M)
 
 /* floor(a0 * factor / 2^16) by halves, as there is no 64-bit product; what is saturated is rare. */
-#define OUTPUT(at, saturate)                                                                          \
-    "ldrh %[u], [%[f], #" at "]\n\t"                                                                  \
+#define OUTPUT(at, factor)                                                                            \
+    "ldrh %[u], [%[o], #" factor "]\n\t" /* after the biases */                                         \
     "asrs %[t], %[a0], #16\n\t"                                                                       \
     "muls %[t], %[u], %[t]\n\t"                                                                       \
     "uxth %[a0], %[a0]\n\t"                                                                           \
     "muls %[a0], %[u], %[a0]\n\t"                                                                     \
     "lsrs %[a0], %[a0], #16\n\t"                                                                      \
     "adds %[a0], %[a0], %[t]\n\t"                                                                     \
-    "asrs %[a0], %[a0], %[shift]\n\t" saturate "strh %[a0], [%[y], #" at "]\n\t"
+    "asrs %[a0], %[a0], %[shift]\n\t"                                                                 \
+    "add  %[a0], %[offset]\n\t"                                                                       \
+    "lsrs %[t], %[a0], #16\n\t"                                                                       \
+    "beq  1f\n\t"                                                                                     \
+    "asrs %[a0], %[a0], #31\n\t"                                                                      \
+    "mvns %[a0], %[a0]\n"                                                                              \
+    "1:\n\t"                                                                                          \
+    "strh %[a0], [%[y], #" at "]\n\t"
 #define NEXT(a) "mov  %[a0], %[" a "]\n\t"
 #define WITHOUT(above)                                                                                \
     "mov  %[t], %[" above "]\n\t"                                                                     \
     "lsls %[t], %[t], #8\n\t"                                                                         \
     "subs %[a0], %[a0], %[t]\n\t"
 #define SHARED "subs %[a0], %[a0], %[shared]\n\t"
-#define FOUR_OUTPUTS(s, y, factor, shift, saturate)                                           \
-    do {                                                                                              \
-        accumulator a0 = (s)->a0;                                                                     \
-        uint32_t t, u;                                                                                \
-        __asm__ volatile(".syntax unified\n" WITHOUT("a1") SHARED OUTPUT("0", saturate)               \
-                             NEXT("a1") WITHOUT("a2") SHARED OUTPUT("2", saturate)                    \
-                                 NEXT("a2") WITHOUT("a3") SHARED OUTPUT("4", saturate)                \
-                                     NEXT("a3") SHARED OUTPUT("6", saturate)                          \
-                         : [a0] "+l"(a0), [t] "=&l"(t), [u] "=&l"(u)                                  \
-                         : [a1] "h"((s)->a1), [a2] "h"((s)->a2), [a3] "h"((s)->a3), [f] "l"(factor), [y] "l"(y), \
-                           [shift] "l"(shift), [shared] "l"((s)->shared), [offset] "h"(OFFSET)             \
-                         : "cc", "memory");                                                           \
-    } while (0)
 
-static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
-    if (relu) {
-        FOUR_OUTPUTS(s, y, factor, shift,
-                     "asrs %[t], %[a0], #31\n\t"
-                     "bics %[a0], %[a0], %[t]\n\t"
-                     "lsrs %[t], %[a0], #15\n\t"
-                     "beq  1f\n\t"
-                     "movs %[a0], #1\n\t"
-                     "lsls %[a0], %[a0], #15\n\t"
-                     "subs %[a0], %[a0], #1\n"
-                     "1:\n\t"
-                     "add  %[a0], %[offset]\n\t");
-    } else {
-        FOUR_OUTPUTS(s, y, factor, shift,
-                     "add  %[a0], %[offset]\n\t"
-                     "lsrs %[t], %[a0], #16\n\t"
-                     "beq  1f\n\t"
-                     "asrs %[a0], %[a0], #31\n\t"
-                     "mvns %[a0], %[a0]\n"
-                     "1:\n\t");
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
+    accumulator a0 = s->a0;
+    uint32_t t, u;
+    __asm__ volatile(
+        ".syntax unified\n"
+        WITHOUT("a1") SHARED OUTPUT("0", "16") NEXT("a1") WITHOUT("a2") SHARED OUTPUT("2", "18")
+        NEXT("a2") WITHOUT("a3") SHARED OUTPUT("4", "20") NEXT("a3") SHARED OUTPUT("6", "22")
+        : [a0] "+l"(a0), [t] "=&l"(t), [u] "=&l"(u)
+        : [a1] "h"(s->a1), [a2] "h"(s->a2), [a3] "h"(s->a3), [o] "l"(o), [y] "l"(y), [shift] "l"(shift),
+          [shared] "l"(s->shared), [offset] "h"(OFFSET)
+        : "cc", "memory");
+    for (pair *two = (void *)y; relu && two != (pair *)(void *)(y + 4); ++two) { /* below OFFSET: OFFSET */
+        const pair positive = *two >> 15 & 0x00010001u;
+        *two = (*two & ((positive << 15) - positive)) | 0x80008000u;
     }
 }
 
@@ -484,11 +491,11 @@ static inline activation output(accumulator acc, uint32_t factor, int shift, int
     return (activation)(relu ? rectified(z) : saturated(z));
 }
 
-static inline void four_outputs(activation *y, const struct four *s, const factors *factor, int shift, int relu) {
-    y[0] = output(s->a0, factor[0], shift, relu);
-    y[1] = output(s->a1, factor[1], shift, relu);
-    y[2] = output(s->a2, factor[2], shift, relu);
-    y[3] = output(s->a3, factor[3], shift, relu);
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
+    y[0] = output(s->a0, o->factors[0], shift, relu);
+    y[1] = output(s->a1, o->factors[1], shift, relu);
+    y[2] = output(s->a2, o->factors[2], shift, relu);
+    y[3] = output(s->a3, o->factors[3], shift, relu);
 }
 
 #endif
@@ -501,11 +508,15 @@ static void dense(const struct layer *l, const activation *x, accumulator shared
     for (const struct outputs *o = l->outputs, *const end = l->end; o != end; ++o, y += 4) {
         struct four s = {.shared = shared};
         w = accumulate(&s, o->biases, w, x, last);
+#ifdef BODY_ARMV6M
+        four_outputs(y, &s, o, shift, relu);
+#else
         if (relu) {
-            four_outputs(y, &s, o->factors, shift, 1);
+            four_outputs(y, &s, o, shift, 1);
         } else {
-            four_outputs(y, &s, o->factors, shift, 0);
+            four_outputs(y, &s, o, shift, 0);
         }
+#endif
 #if TANH
         for (int i = 0; l->hidden && i < 4; ++i) {
             y[i] = (activation)(tanh_of(y[i]) - 32768 + OFFSET);
@@ -536,7 +547,7 @@ static inline int32_t sigmoid(activation z) {
 
 /* A gated recurrent unit of three layers: the gates of the inputs x in `a` and of its own numbers, g; i of x, and m of g. The
    next numbers h take the place of x. r, z = sigmoid(gates), n = tanh(i + r * m), h = n + (h - n) * z */
-static void remember(const struct layer *l, activation *a, activation *y, int16_t h[UNITS]) {
+APART void remember(const struct layer *l, activation *a, activation *y, int16_t h[UNITS]) {
     activation *const g = a + MEMORY_AT;
     const activation *const i = y + INPUT_AT, *const m = i + PADDED_UNITS;
     for (int k = 0; k < PADDED_UNITS; ++k) {
@@ -578,11 +589,6 @@ static const activation *network(union activations *a, union activations *b, @na
     }
     (void)state;
     return a->one;
-}
-
-static int16_t action(activation y, int i) {
-    const int32_t z = (int32_t)y - OFFSET;
-    return (int16_t)(z < act_least[i] ? act_least[i] : z > act_most[i] ? act_most[i] : z);
 }
 
 /* Store one input, saturated, which is rare; returns 1 if saturation changed it. */
@@ -679,7 +685,7 @@ static void turn(union activations *x, int32_t r[9]) {
 #endif
 
 /* The inputs after the observation, which is complete: those of the state, and zeros up to a multiple of 4. */
-static void complete(union activations *x, @name@_state *state) {
+APART void complete(union activations *x, @name@_state *state) {
     int i = SEEN;
 #if INTEGRAL
     integrate(state->integral, x);
@@ -749,18 +755,22 @@ void @name@_reset(@name@_state *state) {
 #endif
 }
 
-int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act[@NAME@_ACT_SIZE]) {
+/* A step in SI units, of float, or with `fixed` in steps of the lsb, of int16_t. */
+static int stepped(@name@_state *state, const void *obs, void *act, int fixed) {
     union activations a, b;
     int status = 0;
-    for (int i = 0; i < @NAME@_OBS_SIZE; ++i) {
+    for (int i = 0; fixed && i < @NAME@_OBS_SIZE; ++i) {
+        status |= put(a.one + i, inputs + i, ((const int16_t *)obs)[i]);
+    }
+    for (int i = 0; !fixed && i < @NAME@_OBS_SIZE; ++i) {
         const union {
             float real;
             uint32_t bits;
-        } in = {obs[i]};
+        } in = {((const float *)obs)[i]};
         const int32_t exponent = in.bits >> 23 & 255;
         if (exponent == 255) { /* infinite or not a number, by its bits: -ffast-math assumes that no float is NaN */
             for (int j = 0; j < @NAME@_ACT_SIZE; ++j) {
-                act[j] = act_safe[j];
+                ((float *)act)[j] = act_safe[j];
             }
             return 2;
         }
@@ -769,62 +779,43 @@ int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act
     complete(&a, state);
     const activation *const y = network(&a, &b, state);
     for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
-        const int16_t steps = action(y[i], i);
+        const int32_t z = (int32_t)y[i] - OFFSET, least = act_least[i], most = act_most[i];
+        const int16_t steps = (int16_t)(z < least ? least : z > most ? most : z);
 #if PREVIOUS_ACTION
         state->previous_action[i] = steps;
 #endif
-        act[i] = (float)steps * act_lsb[i];
+        if (fixed) {
+            ((int16_t *)act)[i] = steps;
+        } else {
+            ((float *)act)[i] = (float)steps * act_lsb[i];
+        }
     }
     return status;
 }
 
+int @name@_step(@name@_state *state, const float obs[@NAME@_OBS_SIZE], float act[@NAME@_ACT_SIZE]) {
+    return stepped(state, obs, act, 0);
+}
+
 int @name@_step_i16(@name@_state *state, const int16_t obs[@NAME@_OBS_SIZE], int16_t act[@NAME@_ACT_SIZE]) {
-    union activations a, b;
-    int status = 0;
-    for (int i = 0; i < @NAME@_OBS_SIZE; ++i) {
-        status |= put(a.one + i, inputs + i, obs[i]);
-    }
-    complete(&a, state);
-    const activation *const y = network(&a, &b, state);
-    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
-        act[i] = action(y[i], i);
-#if PREVIOUS_ACTION
-        state->previous_action[i] = act[i];
-#endif
-    }
-    return status;
+    return stepped(state, obs, act, 1);
 }
 
 #if MEMORY
 
 /* Whether the state is not the one after the last golden vector. */
 static int differs(const @name@_state *state) {
+    const unsigned char *const found = (const void *)state, *const wanted = (const void *)&golden_state;
     int wrong = 0;
-#if PREVIOUS_ACTION
-    for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
-        wrong |= state->previous_action[i] != goldens[GOLDENS - 1].act[i];
+    for (int i = 0; i < STATE_BYTES; ++i) {
+        wrong |= found[i] ^ wanted[i];
     }
-#endif
-#if INTEGRAL
-    for (int i = 0; i < INTEGRAL; ++i) {
-        wrong |= state->integral[i] != golden_integral[i];
-    }
-#endif
-#if UNITS
-    for (int i = 0; i < UNITS; ++i) {
-        wrong |= state->recurrent[i] != golden_recurrent[i];
-    }
-#endif
     return wrong;
 }
 
 #endif
 
 int @name@_selftest(void) {
-    static const union {
-        uint32_t bits[@NAME@_OBS_SIZE];
-        float obs[@NAME@_OBS_SIZE];
-    } not_a_number = {{0x7fc00000u}};
     union {
         float real[@NAME@_ACT_SIZE];
         int16_t steps[@NAME@_ACT_SIZE];
@@ -833,20 +824,20 @@ int @name@_selftest(void) {
     @name@_reset(&state);
     @name@_reset(&state_i16);
     for (int k = 0; k < GOLDENS; ++k) {
-        int wrong = @name@_step(&state, goldens[k].obs, act.real) != goldens[k].status;
+        int wrong = @name@_step(&state, goldens.vectors[k].obs, act.real) != goldens.vectors[k].status;
         for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
-            const volatile float wanted = (float)goldens[k].act[i] * act_lsb[i]; /* rounded to float, also on x87 */
+            const volatile float wanted = (float)goldens.vectors[k].act[i] * act_lsb[i]; /* rounded to float, also on x87 */
             wrong |= !(act.real[i] == wanted);
         }
-        wrong |= @name@_step_i16(&state_i16, goldens[k].obs_i16, act.steps) != goldens[k].status_i16;
+        wrong |= @name@_step_i16(&state_i16, goldens.vectors[k].obs_i16, act.steps) != goldens.vectors[k].status_i16;
         for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
-            wrong |= act.steps[i] != goldens[k].act[i];
+            wrong |= act.steps[i] != goldens.vectors[k].act[i];
         }
         if (wrong) {
             return k + 1;
         }
     }
-    int wrong = @name@_step(&state, not_a_number.obs, act.real) != 2;
+    int wrong = @name@_step(&state, (const void *)&goldens, act.real) != 2; /* begins with no number */
     for (int i = 0; i < @NAME@_ACT_SIZE; ++i) {
         wrong |= !(act.real[i] == act_safe[i]);
     }
