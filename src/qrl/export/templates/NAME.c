@@ -23,7 +23,7 @@
 #define BODY_ARMV6M
 #endif
 
-#if defined(BODY_DSP) || defined(BODY_ARMV6M) /* inlined, these are slower or larger */
+#ifdef BODY_ARMV6M /* few registers: inlined, these are slower */
 #define APART static __attribute__((noinline))
 #else
 #define APART static
@@ -52,13 +52,10 @@ typedef int16_t activation;
 #if defined(BODY_DSP) || defined(BODY_ARMV6M)
 typedef uint8_t weight;
 typedef uint32_t accumulator;
+typedef uint32_t __attribute__((may_alias)) pair;
 #else
 typedef int8_t weight;
 typedef int32_t accumulator;
-#endif
-
-#if defined(BODY_DSP) || defined(BODY_ARMV6M)
-typedef uint32_t __attribute__((may_alias)) pair;
 #endif
 
 #ifdef BODY_DSP /* pairs of halfwords */
@@ -266,7 +263,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-APART accumulator sum_of(const activation *x, const activation *last) {
+static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     uint32_t x0, x1;
     __asm__ volatile(
@@ -320,7 +317,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-APART accumulator sum_of(const activation *x, const activation *last) {
+static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     for (; x != last; x += 4) {
         sum += (accumulator)x[0] + x[1] + x[2] + x[3];
@@ -436,9 +433,9 @@ static inline uint32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t 
 }
 
 static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
-    pair *const two = (void *)y;
-    two[0] = two_outputs(s->a0, s->a1, o->factors[0], shift, relu);
-    two[1] = two_outputs(s->a2, s->a3, o->factors[1], shift, relu);
+    const uint32_t first = two_outputs(s->a0, s->a1, o->factors[0], shift, relu);
+    const uint32_t second = two_outputs(s->a2, s->a3, o->factors[1], shift, relu);
+    __asm__ volatile("strd %0, %1, [%2]" : : "r"(first), "r"(second), "r"(y) : "memory");
 }
 
 #elif defined(BODY_ARMV6M)
