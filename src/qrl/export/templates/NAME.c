@@ -359,26 +359,18 @@ static inline accumulator sum_of(const activation *x, const activation *last) {
 
 #if !(defined(BODY_MVE) || defined(BODY_ARMV6M))
 
-/* Saturated to 16 bits. */
-static inline int32_t saturated(int32_t z) {
+/* Saturated to 16 bits, with `relu` to [0, 32767]. */
+static inline int32_t saturated(int32_t z, int relu) {
 #ifdef SATURATE
-    __asm__("ssat %0, #16, %1" : "=r"(z) : "r"(z));
+    if (relu) {
+        __asm__("usat %0, #15, %1" : "=r"(z) : "r"(z));
+    } else {
+        __asm__("ssat %0, #16, %1" : "=r"(z) : "r"(z));
+    }
     return z;
 #else
-    return z > 32767 ? 32767 : z < -32768 ? -32768 : z;
-#endif
-}
-
-/* ReLU: within [0, 32767]. */
-static inline int32_t rectified(int32_t z) {
-#ifdef SATURATE
-    __asm__("usat %0, #15, %1" : "=r"(z) : "r"(z));
-    return z;
-#else /* without branches */
-    z &= (int32_t)((uint32_t)z >> 31) - 1; /* negative values become 0 */
-    z -= 32767;
-    z &= -(int32_t)((uint32_t)z >> 31); /* values beyond 32767 become 32767 */
-    return z + 32767;
+    const int32_t least = relu ? 0 : -32768;
+    return z > 32767 ? 32767 : z < least ? least : z;
 #endif
 }
 
@@ -415,7 +407,7 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
     const int32x4_t upper = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(o->factors)), 16);
     const int32x4_t z = vshlq_r_s32(vmulhq_s32(s->sums, upper), -shift);
     const int16x8_t within = vqmovnbq_s32(vdupq_n_s16(0), z);
-    vstrhq_s32(y, vreinterpretq_s32_s16(relu ? vmaxq_s16(within, vdupq_n_s16(0)) : within));
+    vstrhq_s32(y, vreinterpretq_s32_s16(vmaxq_s16(within, vdupq_n_s16(relu ? 0 : -32768))));
 }
 
 #elif defined(BODY_DSP)
@@ -426,8 +418,8 @@ static inline uint32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t 
     uint32_t word;
     __asm__("smulwb %0, %1, %2" : "=r"(z0) : "r"(acc0), "r"(factor));
     __asm__("smulwt %0, %1, %2" : "=r"(z1) : "r"(acc1), "r"(factor));
-    z0 = relu ? rectified(z0 >> shift) : saturated(z0 >> shift);
-    z1 = relu ? rectified(z1 >> shift) : saturated(z1 >> shift);
+    z0 = saturated(z0 >> shift, relu);
+    z1 = saturated(z1 >> shift, relu);
     __asm__("pkhbt %0, %1, %2, lsl #16" : "=r"(word) : "r"(z0), "r"(z1));
     return word;
 }
@@ -484,8 +476,7 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
 #else
 
 static inline activation output(accumulator acc, uint32_t factor, int shift, int relu) {
-    const int32_t z = scaled(acc, factor) >> shift;
-    return (activation)(relu ? rectified(z) : saturated(z));
+    return (activation)saturated(scaled(acc, factor) >> shift, relu);
 }
 
 static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
@@ -505,15 +496,13 @@ static void dense(const struct layer *l, const activation *x, accumulator shared
     for (const struct outputs *o = l->outputs, *const end = l->end; o != end; ++o, y += 4) {
         struct four s = {.shared = shared};
         w = accumulate(&s, o->biases, w, x, last);
-#ifdef BODY_ARMV6M
-        four_outputs(y, &s, o, shift, relu);
-#else
+#ifdef SATURATE /* by another instruction */
         if (relu) {
             four_outputs(y, &s, o, shift, 1);
-        } else {
-            four_outputs(y, &s, o, shift, 0);
+            continue;
         }
 #endif
+        four_outputs(y, &s, o, shift, relu);
 #if TANH
         for (int i = 0; l->hidden && i < 4; ++i) {
             y[i] = (activation)(tanh_of(y[i]) - 32768 + OFFSET);
