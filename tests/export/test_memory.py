@@ -517,7 +517,6 @@ def test_one_step_of_a_difference_fails_verification(tmp_path: Path) -> None:
 
 SOURCE_FAULTS = {
     "the action is not kept": ("        state->previous_action[i] = steps;\n", ""),
-    "nor by the other entry": ("        state->previous_action[i] = act[i];\n", ""),
     "the gate is always open": ("inside * inside >> 15", "32768"),
     "no limit": ("limited(integral[i] + more, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)", "integral[i] + more"),
     "rounded down": ("(x + ((int32_t)1 << shift >> 1)) >> shift", "x >> shift"),
@@ -526,15 +525,15 @@ SOURCE_FAULTS = {
         "for (int i = 0; i < INTEGRAL - 1; ++i) {\n        state->integral[i] = 0;",
     ),
     "integrated before it is complete": (
-        "        status |= put(&a, i, quantised",
-        "        state->integral[0] += 1;\n        status |= put(&a, i, quantised",
+        "        status |= put(a.one + i, inputs + i, quantised",
+        "        state->integral[0] += 1;\n        status |= put(a.one + i, inputs + i, quantised",
     ),
 }
 
 
 FRAME_FAULTS = {  # of a policy in the body frame, with heading, previews and the integral
-    "to the world": ("r[3 * i + j]", "r[3 * j + i]"),
-    "the wrong row": ("shifted(r[i], UP_SHIFT)", "shifted(r[i < 3 ? i : i - 3], UP_SHIFT)"),
+    "to the world": ("(r[j] * v0 >> 1) + (r[3 + j] * v1 >> 1)", "(r[3 * j] * v0 >> 1) + (r[3 * j + 1] * v1 >> 1)"),
+    "the wrong row": ("for (int i = 6; i < 9; ++i)", "for (int i = 3; i < 6; ++i)"),
     "a preview left in the world": ("i < 3 * VECTORS", "i < 3 * VECTORS - 3"),
     "a preview's step": ("x->one + 18 + i, 3, AHEAD_SHIFT", "x->one + 18 + i, 3, AHEAD_SHIFT - 1"),
     "the integral left in the world": ("    rotated(x->one + i - LAST, r, last, LAST, 15);\n", "    (void)last;\n"),
@@ -545,14 +544,15 @@ FRAME_FAULTS = {  # of a policy in the body frame, with heading, previews and th
 UNIT_FAULTS = {  # of a recurrent policy
     "no reset": ("        state->recurrent[i] = 0;\n", "        (void)state;\n"),
     "r and z swapped": (
-        "r = sigmoid(ik[0], mk[0]), z = sigmoid(ik[UNITS], mk[UNITS])",
-        "z = sigmoid(ik[0], mk[0]), r = sigmoid(ik[UNITS], mk[UNITS])",
+        "r = sigmoid(y[k]), z = sigmoid(y[k + UNITS])",
+        "z = sigmoid(y[k]), r = sigmoid(y[k + UNITS])",
     ),
-    "no sigmoid": ("+ 32768) >> 1", "+ 32767) >> 1"),
-    "the gates' shift": ("OFFSET, GATE_SHIFT)", "OFFSET, GATE_SHIFT + 1)"),
-    "the candidate's shift": ("more, CANDIDATE_SHIFT)", "more, CANDIDATE_SHIFT + 1)"),
-    "h is not kept": ("        h[k] = (int16_t)(n +", "        a->one[k] = (activation)(n +"),
-    "the inputs for h": ("dense(l + 1, a->one, &m)", "dense(l + 1, i->one, &m)"),
+    "no sigmoid": ("return tanh_of(z) >> 1;", "return (tanh_of(z) - 1) >> 1;"),
+    "the memory's shift": ("shifted(h[k], MEMORY_SHIFT)", "shifted(h[k], MEMORY_SHIFT + 1)"),
+    "the candidate's shift": ("* (1 << CANDIDATE_SHIFT) + OFFSET", "* (2 << CANDIDATE_SHIFT) + OFFSET"),
+    "a candidate beyond the table": ("(sum < 0 ? -32768 : 32767) + OFFSET", "sum & 32767"),
+    "h is not kept": ("        h[k] = (int16_t)next;\n", ""),
+    "the inputs for h": ("dense(l + 2, g, of_g,", "dense(l + 2, a, of_g,"),
 }
 
 
@@ -577,14 +577,16 @@ def test_a_slip_in_the_source_shows(which: str, fault: tuple[str, str], tmp_path
 
 @pytest.mark.usefixtures("host")
 @pytest.mark.parametrize(
-    ("fault", "by"),
-    [("golden_integral", 1), ("act_first", 2000), ("errors", 1), ("positions", 1), ("golden_recurrent", 1)],
+    ("fault", "by", "which"),
+    [
+        *((fault, by, "both") for fault, by in (("golden_state", 1), ("act_first", 2000), ("errors", 1), ("positions", 1))),
+        ("golden_state", 1, "recurrent alone"),
+    ],
 )
-def test_the_self_test_sees_the_memory(fault: str, by: int, tmp_path: Path) -> None:
-    which = "recurrent" if fault == "golden_recurrent" else "both"
+def test_the_self_test_sees_the_memory(fault: str, by: int, which: str, tmp_path: Path) -> None:
     source = policies.emitted(tmp_path, policies.remembering(which), policies.remembering_kernel(which))
     text = source.read_text()
-    at = text.index("= {", text.index(f" {fault}[")) + 3
+    at = text.index("= {", text.index(f" {fault}")) + 3
     first = next(number for number in text[at:].replace("{", " ").replace(",", " ").split())
     start = text.index(first, at)
     source.write_text(text[:start] + str(int(first) + by) + text[start + len(first) :])

@@ -368,12 +368,12 @@ def test_the_verification_of_another_kernel_fails(tmp_path: Path) -> None:
 
 
 SOURCE_FAULTS = {
-    "no saturation": ("z > 32767 ? 32767 : z < -32768 ? -32768 : z", "z"),
+    "no saturation": ("z > 32767 ? 32767 : z < least ? least : z", "z"),
     "rounds down": ("+ 1u) / 2u", ") / 2u"),
-    "infinity passes": ("(in.bits & 0x7f800000u) == 0x7f800000u", "in.real != in.real"),
-    "status of a clip": ("return within != q;", "return 0;"),
-    "an input out of place": ("x->one[i] = (activation)", "x->one[i ^ 1] = (activation)"),
-    "an action out of place": ("act[i] = action(y[i], i);", "act[i] = action(y[i ^ 1], i);"),
+    "infinity passes": ("exponent == 255", "in.real != in.real"),
+    "status of a clip": ("        return 1;\n", "        return 0;\n"),
+    "an input out of place": ("put(a.one + i,", "put(a.one + (i ^ 1),"),
+    "an action out of place": ("((int16_t *)act)[i] = steps", "((int16_t *)act)[i ^ 1] = steps"),
 }
 
 

@@ -33,15 +33,13 @@ def literal_network(kernel: Kernel, x: list[int], h: list[int]) -> tuple[list[in
         relu = kernel.activation == "relu"
         x = [max(z, 0) if relu else literal_tanh(z) for z in literal_dense(layer, x)]
     if unit := kernel.unit:
-        i, m, units = literal_dense(unit.of_input, x), literal_dense(unit.of_memory, h), len(h)
-
-        def tanh(total: int, shift: int) -> int:
-            return literal_tanh(limited(total * 2**shift, -(2**15), 2**15 - 1))
-
+        g = [(value + 2**unit.memory_shift // 2) // 2**unit.memory_shift for value in h]
+        gates, i, m = literal_dense(unit.gates, x + g), literal_dense(unit.of_input, x), literal_dense(unit.of_memory, g)
         after = []
-        for k in range(units):
-            r, z = ((tanh(i[at] + m[at], unit.gate_shift) + 32768) // 2 for at in (k, units + k))
-            n = tanh(i[2 * units + k] + (r * m[2 * units + k] + 2**14) // 2**15, unit.shift)
+        for k in range(len(h)):
+            r, z = ((literal_tanh(gates[at]) + 32768) // 2 for at in (k, len(h) + k))
+            total = (i[k] + (r * m[k] + 2**14) // 2**15) * 2**unit.shift
+            n = literal_tanh(limited(total, -(2**15), 2**15 - 1))
             after.append(n + ((h[k] - n) * z + 2**14) // 2**15)
         x = h = after
     y = literal_dense(kernel.layers[-1], x)
