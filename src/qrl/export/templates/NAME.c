@@ -23,7 +23,7 @@
 #define BODY_ARMV6M
 #endif
 
-#ifdef BODY_ARMV6M /* few registers: inlined, these are slower */
+#ifdef __GNUC__ /* inlined, these take more stack, flash or time */
 #define APART static __attribute__((noinline))
 #else
 #define APART static
@@ -263,7 +263,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
+APART accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     uint32_t x0, x1;
     __asm__ volatile(
@@ -317,7 +317,7 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
 }
 
 /* 2^7 times the sum of the activations, which u = w + 2^7 adds. */
-static __attribute__((noinline)) accumulator sum_of(const activation *x, const activation *last) {
+APART accumulator sum_of(const activation *x, const activation *last) {
     accumulator sum = 0;
     for (; x != last; x += 4) {
         sum += (accumulator)x[0] + x[1] + x[2] + x[3];
@@ -400,14 +400,24 @@ static inline int32_t scaled(int32_t x, uint32_t factor) {
 
 #endif
 
-/* Four outputs from their sums, saturated to 16 bits, of a layer with `relu` to [0, 32767]. */
+/* Four outputs from their sums; `hidden` layers have an activation. */
 #if defined(BODY_MVE)
 
-static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int hidden) {
     const int32x4_t upper = vshlq_n_s32(vreinterpretq_s32_u32(vldrhq_u32(o->factors)), 16);
     const int32x4_t z = vshlq_r_s32(vmulhq_s32(s->sums, upper), -shift);
-    const int16x8_t within = vqmovnbq_s32(vdupq_n_s16(0), z);
-    vstrhq_s32(y, vreinterpretq_s32_s16(vmaxq_s16(within, vdupq_n_s16(relu ? 0 : -32768))));
+    const int16x8_t within = vqmovnbq_s32(vdupq_n_s16(0), z); /* in the lower halves of four words */
+#if TANH
+    if (hidden) { /* as tanh_of */
+        const uint32x4_t u = veorq_u32(vreinterpretq_u32_s16(within), vdupq_n_u32(32768)), at = vshrq_n_u32(u, 8);
+        const uint32x4_t low = vldrhq_gather_shifted_offset_u32(tanh_table, at);
+        const uint32x4_t rise = vsubq_u32(vldrhq_gather_shifted_offset_u32(tanh_table + 1, at), low);
+        const uint32x4_t more = vrshrq_n_u32(vmulq_u32(rise, vandq_u32(u, vdupq_n_u32(255))), 8);
+        vstrhq_u32((uint16_t *)y, vsubq_u32(vaddq_u32(low, more), vdupq_n_u32(32768)));
+        return;
+    }
+#endif
+    vstrhq_s32(y, vreinterpretq_s32_s16(vmaxq_s16(within, vdupq_n_s16(hidden ? 0 : -32768))));
 }
 
 #elif defined(BODY_DSP)
@@ -424,9 +434,9 @@ static inline uint32_t two_outputs(accumulator acc0, accumulator acc1, uint32_t 
     return word;
 }
 
-static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
-    const uint32_t first = two_outputs(s->a0, s->a1, o->factors[0], shift, relu);
-    const uint32_t second = two_outputs(s->a2, s->a3, o->factors[1], shift, relu);
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int hidden) {
+    const uint32_t first = two_outputs(s->a0, s->a1, o->factors[0], shift, hidden && !TANH);
+    const uint32_t second = two_outputs(s->a2, s->a3, o->factors[1], shift, hidden && !TANH);
     __asm__ volatile("strd %0, %1, [%2]" : : "r"(first), "r"(second), "r"(y) : "memory");
 }
 
@@ -456,7 +466,7 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
     "subs %[a0], %[a0], %[t]\n\t"
 #define SHARED "subs %[a0], %[a0], %[shared]\n\t"
 
-static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int hidden) {
     accumulator a0 = s->a0;
     uint32_t t, u;
     __asm__ volatile(
@@ -467,7 +477,7 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
         : [a1] "h"(s->a1), [a2] "h"(s->a2), [a3] "h"(s->a3), [o] "l"(o), [y] "l"(y), [shift] "l"(shift),
           [shared] "l"(s->shared), [offset] "h"(OFFSET)
         : "cc", "memory");
-    for (pair *two = (void *)y; relu && two != (pair *)(void *)(y + 4); ++two) { /* below OFFSET: OFFSET */
+    for (pair *two = (void *)y; hidden && !TANH && two != (pair *)(void *)(y + 4); ++two) { /* below OFFSET: OFFSET */
         const pair positive = *two >> 15 & 0x00010001u;
         *two = (*two & ((positive << 15) - positive)) | 0x80008000u;
     }
@@ -475,36 +485,43 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
 
 #else
 
-static inline activation output(accumulator acc, uint32_t factor, int shift, int relu) {
-    return (activation)saturated(scaled(acc, factor) >> shift, relu);
+static inline activation output(accumulator acc, uint32_t factor, int shift, int hidden) {
+    const int32_t z = saturated(scaled(acc, factor) >> shift, hidden && !TANH);
+#if TANH
+    return (activation)(hidden ? tanh_of(z) - 32768 : z);
+#else
+    return (activation)z;
+#endif
 }
 
-static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int relu) {
-    y[0] = output(s->a0, o->factors[0], shift, relu);
-    y[1] = output(s->a1, o->factors[1], shift, relu);
-    y[2] = output(s->a2, o->factors[2], shift, relu);
-    y[3] = output(s->a3, o->factors[3], shift, relu);
+static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int hidden) {
+    y[0] = output(s->a0, o->factors[0], shift, hidden);
+    y[1] = output(s->a1, o->factors[1], shift, hidden);
+    y[2] = output(s->a2, o->factors[2], shift, hidden);
+    y[3] = output(s->a3, o->factors[3], shift, hidden);
 }
 
 #endif
 
 /* One layer, four outputs at a time; x, whose sum is `shared`, and y are aligned to pairs. */
-static void dense(const struct layer *l, const activation *x, accumulator shared, activation *y) {
+APART void dense(const struct layer *l, const activation *x, accumulator shared, activation *y) {
     const activation *const last = x + l->inputs;
     const weight *w = l->weights;
-    const int shift = l->shift, relu = l->hidden && !TANH;
+    const int shift = l->shift, hidden = l->hidden;
     for (const struct outputs *o = l->outputs, *const end = l->end; o != end; ++o, y += 4) {
         struct four s = {.shared = shared};
         w = accumulate(&s, o->biases, w, x, last);
-#ifdef SATURATE /* by another instruction */
-        if (relu) {
+#ifdef SATURATE /* by other instructions */
+        if (hidden) {
             four_outputs(y, &s, o, shift, 1);
-            continue;
+        } else {
+            four_outputs(y, &s, o, shift, 0);
         }
+#else
+        four_outputs(y, &s, o, shift, hidden);
 #endif
-        four_outputs(y, &s, o, shift, relu);
-#if TANH
-        for (int i = 0; l->hidden && i < 4; ++i) {
+#if TANH && (defined(BODY_DSP) || defined(BODY_ARMV6M))
+        for (int i = 0; hidden && i < 4; ++i) {
             y[i] = (activation)(tanh_of(y[i]) - 32768 + OFFSET);
         }
 #endif
@@ -671,7 +688,7 @@ static void turn(union activations *x, int32_t r[9]) {
 #endif
 
 /* The inputs after the observation, which is complete: those of the state, and zeros up to a multiple of 4. */
-APART void complete(union activations *x, @name@_state *state) {
+static void complete(union activations *x, @name@_state *state) {
     int i = SEEN;
 #if INTEGRAL
     integrate(state->integral, x);
