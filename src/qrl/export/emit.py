@@ -272,7 +272,7 @@ def _tables(kernel: Kernel, golden: Vectors, name: str) -> str:
     columns = kernel.scale, kernel.exponent - 1, kernel.obs_min, kernel.obs_max - kernel.obs_min
     inputs = (f"{{{s}u, {e}, {low}, {span}u}}" for s, e, low, span in zip(*columns, strict=True))
     parts = [
-        f"#define LAYERS {len(layers)}\n#define PADDED_INPUTS {layers[0].shape[1]}",
+        f"#define LAYERS {len(layers)}\n#define INPUTS {kernel.widths[0]}\n#define PADDED_INPUTS {layers[0].shape[1]}",
         _array(f"struct input inputs[{prefix}_OBS_SIZE]", inputs, 6),
         _array(f"float act_lsb[{prefix}_ACT_SIZE]", map(_float, kernel.act_lsb), 4),
         _array(f"float act_safe[{prefix}_ACT_SIZE]", map(_float, kernel.act_safe), 4),

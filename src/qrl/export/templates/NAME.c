@@ -52,7 +52,6 @@ typedef int16_t activation;
 #if defined(BODY_DSP) || defined(BODY_ARMV6M)
 typedef uint8_t weight;
 typedef uint32_t accumulator;
-typedef uint32_t __attribute__((may_alias)) pair;
 #else
 typedef int8_t weight;
 typedef int32_t accumulator;
@@ -477,8 +476,9 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
         : [a1] "h"(s->a1), [a2] "h"(s->a2), [a3] "h"(s->a3), [o] "l"(o), [y] "l"(y), [shift] "l"(shift),
           [shared] "l"(s->shared), [offset] "h"(OFFSET)
         : "cc", "memory");
+    typedef uint32_t __attribute__((may_alias)) pair;
     for (pair *two = (void *)y; hidden && !TANH && two != (pair *)(void *)(y + 4); ++two) { /* below OFFSET: OFFSET */
-        const pair positive = *two >> 15 & 0x00010001u;
+        const uint32_t positive = *two >> 15 & 0x00010001u;
         *two = (*two & ((positive << 15) - positive)) | 0x80008000u;
     }
 }
@@ -550,7 +550,12 @@ static inline int32_t sigmoid(activation z) {
 
 /* A gated recurrent unit of three layers: the gates of the inputs x in `a` and of its own numbers, g; i of x, and m of g. The
    next numbers h take the place of x. r, z = sigmoid(gates), n = tanh(i + r * m), h = n + (h - n) * z */
-APART void remember(const struct layer *l, activation *a, activation *y, int16_t h[UNITS]) {
+#ifdef BODY_ARMV6M /* which has few registers */
+APART
+#else
+static
+#endif
+void remember(const struct layer *l, activation *a, activation *y, int16_t h[UNITS]) {
     activation *const g = a + MEMORY_AT;
     const activation *const i = y + INPUT_AT, *const m = i + PADDED_UNITS;
     for (int k = 0; k < PADDED_UNITS; ++k) {
@@ -689,7 +694,6 @@ static void turn(union activations *x, int32_t r[9]) {
 
 /* The inputs after the observation, which is complete: those of the state, and zeros up to a multiple of 4. */
 static void complete(union activations *x, @name@_state *state) {
-    int i = SEEN;
 #if INTEGRAL
     integrate(state->integral, x);
 #endif
@@ -698,6 +702,7 @@ static void complete(union activations *x, @name@_state *state) {
     turn(x, r);
 #endif
 #if KEPT
+    int i = SEEN;
     for (const struct kept *k = kept; k != kept + KEPT; ++i, ++k) {
         const int at = i - SEEN;
 #if PREVIOUS_ACTION && INTEGRAL
@@ -715,13 +720,12 @@ static void complete(union activations *x, @name@_state *state) {
         last[k] = x->one[i - LAST + k];
     }
     rotated(x->one + i - LAST, r, last, LAST, 15);
-    i += 3 - LAST;
 #endif
 #else
     (void)state;
 #endif
-    for (; i < PADDED_INPUTS; ++i) {
-        x->one[i] = (activation)OFFSET;
+    for (int k = INPUTS; k < PADDED_INPUTS; ++k) {
+        x->one[k] = (activation)OFFSET;
     }
 }
 
