@@ -1,6 +1,7 @@
 """The integer policy and its arithmetic in NumPy: the reference for the emitted C."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -266,6 +267,7 @@ def _check_fields(kernel: Kernel) -> None:
             raise AccumulatorOverflow(f"{name} is outside [{low}, {high}]")
 
 
+@cache
 def tanh_table() -> Ints:
     """tanh at 257 points from −TANH_RANGE to TANH_RANGE, in 1/32767; [257]."""
     return np.round(np.tanh(np.linspace(-TANH_RANGE, TANH_RANGE, 257)) * INT16).astype(np.int64)

@@ -248,15 +248,13 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
         "bne    2f\n" /* an odd number of fours: from the middle */
         "1:\n\t" FOUR_INPUTS "2:\n\t" FOUR_INPUTS
         "subs   %[fours], #2\n\t"
-        "bgt    1b\n\t"
-        "sub    %[a0], %[a0], %[a1], lsl #8\n\t"
-        "sub    %[a2], %[a2], %[a3], lsl #8\n\t"
-        "sub    %[a0], %[a0], %[shared]\n\t"
-        "sub    %[a2], %[a2], %[shared]"
+        "bgt    1b"
         : [a0] "+r"(a0), [a1] "+r"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+r"(w), [x] "+r"(x), [w0] "=&r"(w0),
           [w1] "=&r"(w1), [x0] "=&r"(x0), [x1] "=&r"(x1), [fours] "+r"(fours)
-        : [shared] "r"(s->shared)
+        :
         : "cc", "memory");
+    __asm__ volatile("sub %0, %0, %1, lsl #8\n\tsub %0, %0, %2" : "+r"(a0) : "r"(a1), "r"(s->shared));
+    __asm__ volatile("sub %0, %0, %1, lsl #8\n\tsub %0, %0, %2" : "+r"(a2) : "r"(a3), "r"(s->shared));
     s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
     return w;
 }
@@ -280,6 +278,15 @@ APART accumulator sum_of(const activation *x, const activation *last) {
 
 #elif defined(BODY_ARMV6M)
 
+/* In a high register; with -Os GCC has none to allocate but those named. */
+#ifdef __OPTIMIZE_SIZE__
+#define HIGH(name, in) name __asm__(in)
+#define H "r"
+#else
+#define HIGH(name, in) name
+#define H "h"
+#endif
+
 #define MAC(word, shift, a)                    \
     "lsrs %[t], " word ", #" shift "\n\t"      \
     "muls %[t], %[in], %[t]\n\t"               \
@@ -292,13 +299,15 @@ APART accumulator sum_of(const activation *x, const activation *last) {
 
 static inline const weight *accumulate(struct four *s, const accumulator *biases, const weight *w, const activation *x,
                                        const activation *last) {
-    accumulator a0 = biases[0], a1 = biases[1];
+    accumulator a0 = biases[0];
+    register accumulator HIGH(a1, "r8");
     register accumulator a2 __asm__("r12");
     register accumulator a3 __asm__("r14");
     register uint32_t w0 __asm__("r4");
     register uint32_t w1 __asm__("r5");
+    register const activation *HIGH(end, "r10");
     uint32_t in, t;
-    a2 = biases[2], a3 = biases[3];
+    a1 = biases[1], a2 = biases[2], a3 = biases[3], end = last;
     __asm__ volatile(
         ".syntax unified\n"
         "1:\n\t"
@@ -307,9 +316,9 @@ static inline const weight *accumulate(struct four *s, const accumulator *biases
         "adds %[x], %[x], #8\n\t"
         "cmp  %[x], %[last]\n\t"
         "bne  1b"
-        : [a0] "+l"(a0), [a1] "+h"(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
+        : [a0] "+l"(a0), [a1] "+" H(a1), [a2] "+r"(a2), [a3] "+r"(a3), [w] "+l"(w), [x] "+l"(x), [in] "=&l"(in),
           [t] "=&l"(t), "=&l"(w0), "=&l"(w1)
-        : [last] "h"(last)
+        : [last] H(end)
         : "cc", "memory");
     s->a0 = a0, s->a1 = a1, s->a2 = a2, s->a3 = a3;
     return w;
@@ -467,14 +476,19 @@ static inline void four_outputs(activation *y, const struct four *s, const struc
 
 static inline void four_outputs(activation *y, const struct four *s, const struct outputs *o, int shift, int hidden) {
     accumulator a0 = s->a0;
+    register accumulator HIGH(a1, "r8");
+    register accumulator a2 __asm__("r12");
+    register accumulator a3 __asm__("r14");
+    register uint32_t HIGH(offset, "r11");
     uint32_t t, u;
+    a1 = s->a1, a2 = s->a2, a3 = s->a3, offset = OFFSET;
     __asm__ volatile(
         ".syntax unified\n"
         WITHOUT("a1") SHARED OUTPUT("0", "16") NEXT("a1") WITHOUT("a2") SHARED OUTPUT("2", "18")
         NEXT("a2") WITHOUT("a3") SHARED OUTPUT("4", "20") NEXT("a3") SHARED OUTPUT("6", "22")
         : [a0] "+l"(a0), [t] "=&l"(t), [u] "=&l"(u)
-        : [a1] "h"(s->a1), [a2] "h"(s->a2), [a3] "h"(s->a3), [o] "l"(o), [y] "l"(y), [shift] "l"(shift),
-          [shared] "l"(s->shared), [offset] "h"(OFFSET)
+        : [a1] H(a1), [a2] "r"(a2), [a3] "r"(a3), [o] "l"(o), [y] "l"(y), [shift] "l"(shift),
+          [shared] "l"(s->shared), [offset] H(offset)
         : "cc", "memory");
     typedef uint32_t __attribute__((may_alias)) pair;
     for (pair *two = (void *)y; hidden && !TANH && two != (pair *)(void *)(y + 4); ++two) { /* below OFFSET: OFFSET */
