@@ -580,7 +580,10 @@ def test_a_slip_in_the_source_shows(which: str, fault: tuple[str, str], tmp_path
 @pytest.mark.parametrize(
     ("fault", "by", "which"),
     [
-        *((fault, by, "both") for fault, by in (("golden_state", 1), ("act_first", 2000), ("errors", 1), ("positions", 1))),
+        ("golden_state", 1, "both"),
+        ("act_first", 2000, "both"),
+        ("errors", 1, "both"),
+        ("positions", 1, "both"),
         ("golden_state", 1, "recurrent alone"),
     ],
 )

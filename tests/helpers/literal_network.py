@@ -34,7 +34,8 @@ def literal_network(kernel: Kernel, x: list[int], h: list[int]) -> tuple[list[in
         x = [max(z, 0) if relu else literal_tanh(z) for z in literal_dense(layer, x)]
     if unit := kernel.unit:
         g = [(value + 2**unit.memory_shift // 2) // 2**unit.memory_shift for value in h]
-        gates, i, m = literal_dense(unit.gates, x + g), literal_dense(unit.of_input, x), literal_dense(unit.of_memory, g)
+        gates = literal_dense(unit.gates, x + g)
+        i, m = literal_dense(unit.of_input, x), literal_dense(unit.of_memory, g)
         after = []
         for k in range(len(h)):
             r, z = ((literal_tanh(gates[at]) + 32768) // 2 for at in (k, len(h) + k))

@@ -238,7 +238,8 @@ def _widest(kernel: Kernel) -> int:
     widest = max(_padded(len(kernel.scale)), *(size for layer in _layers(kernel) for size in layer.shape))
     if unit := kernel.unit:
         given = unit.of_input.weight.shape[1]
-        widest = max(widest, _padded(given, 8) + _padded(unit.units, 8), _padded(2 * unit.units) + 2 * _padded(unit.units))
+        widest = max(widest, _padded(given, 8) + _padded(unit.units, 8))
+        widest = max(widest, _padded(2 * unit.units) + 2 * _padded(unit.units))
     return widest
 
 
@@ -335,12 +336,11 @@ def _layer_tables(index: int, layer: _Layer) -> str:
     bias, multiplier, sums = (
         np.pad(x, (0, -len(x) % 4)) for x in (layer.dense.bias, layer.dense.multiplier, layer.dense.weight.sum(axis=1))
     )
-    rows = (
-        "{{B4(%s)}, {M2(%s, %s), M2(%s, %s)}}" % (", ".join(f"{a}, {b}" for a, b in zip(*sums, strict=True)), *factors)
-        for sums, factors in zip(
-            np.stack([bias, sums], axis=1).reshape(-1, 4, 2).swapaxes(1, 2), multiplier.reshape(-1, 4)
-        )
-    )
+    rows = []
+    for at in range(0, len(bias), 4):
+        biases = ", ".join(f"{bias[i]}, {sums[i]}" for i in range(at, at + 4))
+        pairs = ", ".join(f"M2({multiplier[i]}, {multiplier[i + 1]})" for i in (at, at + 2))
+        rows.append(f"{{{{B4({biases})}}, {{{pairs}}}}}")
     return "\n".join(
         [
             f"static const union {{\n    weight w[{len(bias)} * ({_sizes(layer, 'TILES')})];",
@@ -381,7 +381,8 @@ def _golden_tables(kernel: Kernel, golden: Vectors, n: int, name: str) -> list[s
         obs_i16, act = (", ".join(map(str, x[i])) for x in (golden.obs_i16, golden.outputs.act_i16))
         columns = f"{{{_floats(golden.obs[i])}}}", f"{{{obs_i16}}}", f"{{{act}}}"
         rows.append(f"{{{', '.join(columns)}, {golden.outputs.status[i]}, {golden.outputs.status_i16[i]}}}")
-    vectors = ["static const struct goldens goldens = {", "    {0x7fc00000u},", "    {", *_lines(rows, 1), "    },", "};"]
+    head = "static const struct goldens goldens = {", "    {0x7fc00000u},", "    {"
+    vectors = [*head, *_lines(rows, 1), "    },", "};"]
     if kernel.memory is None:
         return ["\n".join(vectors)]
     state = np.ascontiguousarray(golden.outputs.state[n - 1])

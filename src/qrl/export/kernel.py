@@ -86,8 +86,8 @@ class GatedUnit:
     """A gated recurrent unit (`policy.GatedUnit`) of inputs x and h, in 1/32767.
 
     With g = ⌊h / 2^memory_shift⌉, r and z are (t + 32768) >> 1, t the tanh of half of the gate's sum; n is the tanh of
-    (i + ⌊r·m / 2¹⁵⌉)·2^shift; the next h is n + ⌊(h − n)·z / 2¹⁵⌉. The arguments of tanh are saturated, and so are i and
-    m, which the shift keeps within 16 bits.
+    (i + ⌊r·m / 2¹⁵⌉)·2^shift; the next h is n + ⌊(h − n)·z / 2¹⁵⌉. The arguments of tanh are saturated, and so are i
+    and m, which the shift keeps within 16 bits.
     """
 
     gates: Dense  # half of the sums of r and z, of x and g
