@@ -28,6 +28,7 @@ class ActionPort(NamedTuple):
     position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
     quantity: str | None = None  # where `unit` does not say it
+    thrust_curve: float = 0.0  # of a motor, c: thrust is c·w + (1 − c)·w² of its greatest, w its speed of its greatest
 
 
 def observations(task: Task) -> list[ObservationPort]:
@@ -102,6 +103,7 @@ def actions(task: Task) -> list[ActionPort]:
             safe=hover[i - 1],
             position_m=motor.position_m,
             spin=motor.spin,
+            thrust_curve=vehicle.thrust_curve,
         )
         for i, motor in enumerate(vehicle.motors, 1)
     ]

@@ -18,7 +18,7 @@ from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun, flown_inputs
-from qrl.export import crazyflie, emit, vectors
+from qrl.export import betaflight, crazyflie, emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import Ints, Kernel
@@ -89,13 +89,15 @@ def export_run(
         folder = Path(scratch) / "export"
         emitted = emit.files(policy, kernel, vectors.golden(policy, kernel), name)
         _write(folder, emitted)
-        _write(folder, crazyflie.files(policy, emitted, name))
+        for adapter in (crazyflie, betaflight):
+            _write(folder, adapter.files(policy, emitted, name))
         (folder / f"{name}.onnx").write_bytes(portable.onnx_model(policy))
         (folder / f"{name}.npz").write_bytes(portable.arrays(policy))
         log("compiling and verifying; flying")
         verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)
-        _write(folder, {"report.md": report(policy, kernel, measured, name) + crazyflie.section(policy)})
+        sections = "".join(adapter.section(policy) for adapter in (crazyflie, betaflight))
+        _write(folder, {"report.md": report(policy, kernel, measured, name) + sections})
         previous = Path(scratch) / "previous"
         if target.exists():
             target.replace(previous)

@@ -79,11 +79,15 @@ def any_vehicle(policy: Policy) -> bool:
     return all(port.quantity == "rotor speed fraction" for port in policy.actions)
 
 
+def observes_vehicle(policy: Policy) -> bool:
+    """Whether it is given a vehicle's state, and besides that at most previews of a reference."""
+    names, ahead = [port.name for port in policy.observations], policy.observations[18:]
+    return names[:18] == MEASURED and all(port.ahead_s is not None for port in ahead) and len(ahead) % 3 == 0
+
+
 def refusal(policy: Policy) -> str | None:
     """Why a policy cannot fly on a Crazyflie, in one line; None if it can."""
-    names = [port.name for port in policy.observations]
-    previews = [(axis, k) for k, axis in enumerate(port.name[-1] for port in policy.observations[18:])]
-    if names[:18] != MEASURED or any(port.ahead_s is None for port in policy.observations[18:]) or len(previews) % 3:
+    if not observes_vehicle(policy):
         return "the observation is not a vehicle's state, and previews of a reference"
     if len(policy.actions) != 4:
         return f"a Crazyflie has four motors, and the policy {len(policy.actions)}"
@@ -111,7 +115,7 @@ def refusal(policy: Policy) -> str | None:
 
 def motor_order(policy: Policy) -> list[int] | str:
     """The action of each of M1 to M4, by position and spin; or why there is none."""
-    found = [_quadrant(port) for port in policy.actions]
+    found = [quadrant(port) for port in policy.actions]
     order = []
     for number, (x, y, spin) in enumerate(MOTORS, 1):
         there = [i for i, place in enumerate(found) if place and place[:2] == (x, y)]
@@ -126,7 +130,7 @@ def motor_order(policy: Policy) -> list[int] | str:
     return order
 
 
-def _quadrant(port: ActionSpec) -> tuple[int, int, int | None] | None:
+def quadrant(port: ActionSpec) -> tuple[int, int, int | None] | None:
     """Signs of a motor's x and y, and its spin; None if it has no place off the axes."""
     if port.position_m is None or 0.0 in port.position_m[:2]:
         return None

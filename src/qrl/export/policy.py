@@ -32,6 +32,7 @@ class ActionSpec:
     position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
     quantity: str | None = None  # where `unit` does not say it
+    thrust_curve: float = 0.0  # of a motor, c: thrust is c·w + (1 − c)·w² of its greatest, w its speed of its greatest
 
     @property
     def limits(self) -> tuple[float, float]:

@@ -1,0 +1,4 @@
+#ifndef PLATFORM_H
+#define PLATFORM_H
+/* Stands for Indiflight's. */
+#endif
