@@ -12,6 +12,7 @@ from importlib import resources
 from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from qrl_envs.specfile import BadInput, Count, Fraction, NonNegative, Positive, nearest
@@ -99,6 +100,12 @@ class Config(BaseModel):
     observation_scale: Traced[tuple[Positive, ...] | None] = Field(
         description="factor on each observation before the networks; null: 1"
     )
+    observation_limit: Static[tuple[Positive | None, ...] | None] = Field(
+        default=None,
+        exclude_if=lambda x: x is None,  # a run of before it was there has the same fingerprint
+        description="greatest size of each of the first observations, before their factor: beyond it they are clipped;"
+        " null: none",
+    )
     normalize_observations: Static[bool] = Field(
         description="standardize observations by their running mean and deviation"
     )
@@ -170,6 +177,8 @@ class Config(BaseModel):
                     "expected updates_per_unroll minibatches of batch_size trajectories that make whole passes over"
                     f" num_envs = {self.num_envs} with sampling epochs"
                 )
+        if self.observation_limit and self.normalize_observations:
+            raise ValueError("expected normalize_observations false with observation_limit")
         if self.policy_gru_size and not self.policy_hidden_layer_sizes:
             raise ValueError("expected policy_hidden_layer_sizes of at least one layer with policy_gru_size")
         if self.policy_gru_size and self.symmetries:
@@ -200,6 +209,11 @@ class Config(BaseModel):
         """What two runs must share to share a compiled program, as JSON values."""
         shapes = {name: x.shape for name, x in self.hyperparameters._asdict().items() if x is not None}
         return {**self.model_dump(mode="json", exclude=set(Hyperparameters._fields)), "traced": shapes}
+
+    def observation_limits(self, size: int) -> NDArray[np.float32]:
+        """`observation_limit` of the first `size` observations, infinite where there is none; [size]."""
+        given = [np.inf if limit is None else limit for limit in (self.observation_limit or ())[:size]]
+        return np.array([*given, *[np.inf] * (size - len(given))], np.float32)
 
     @property
     def shard_count(self) -> int:

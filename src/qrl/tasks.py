@@ -214,6 +214,7 @@ NETWORK = (
     "policy_gru_size",
     "activation",
     "observation_scale",
+    "observation_limit",
     "normalize_observations",
 )
 FINE_TUNING = "fine_tune"  # the preset of a run that begins with a trained policy
@@ -297,6 +298,8 @@ def check(env: Env, learner: Config, where: str) -> None:
         raise BadInput(
             f"{where}: key 'observation_scale': expected {size} numbers, one for each observation, found {given}"
         )
+    if (given := len(learner.observation_limit or ())) > size:
+        raise BadInput(f"{where}: key 'observation_limit': expected at most {size} numbers, found {given}")
     _check_frame(env, learner, where)
     try:
         adapt(env)

@@ -100,6 +100,9 @@ def sigma(hyper: Hyperparameters, state: LearnerState) -> chex.Array:
 def preprocess(spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState, observation: chex.Array) -> chex.Array:
     """The networks' input of observations, or of the first of their numbers; [..., F] -> [..., F]."""
     size = observation.shape[-1]
+    if spec.config.observation_limit:
+        most = spec.config.observation_limits(size)
+        observation = jnp.clip(observation, -most, most)
     if spec.config.normalize_observations:
         deviation = running_statistics.std(state.statistics)[:size]
         standard = (observation - state.statistics.mean[:size]) / deviation

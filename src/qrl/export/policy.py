@@ -198,7 +198,7 @@ class Policy:
     actions: tuple[ActionSpec, ...]
     observation_offset: NDArray[np.float64]  # [I_0] the network's input is clip((o − offset)·gain, ±clip)·scale
     observation_gain: NDArray[np.float64]  # [I_0]
-    observation_clip: float  # infinite without clipping
+    observation_clip: NDArray[np.float64] | float  # [I_0] or of all; infinite without clipping
     observation_scale: NDArray[np.float64]  # [I_0]
     layers: tuple[Layer, ...]
     activation: str  # of all layers but the last: "relu" or "tanh"

@@ -36,8 +36,9 @@ def onnx_model(policy: Policy) -> bytes:
     x = graph.node(
         "Mul", graph.node("Sub", x, graph.constant(policy.observation_offset)), graph.constant(policy.observation_gain)
     )
-    if np.isfinite(policy.observation_clip):
-        x = graph.clip(x, -policy.observation_clip, policy.observation_clip)
+    if np.isfinite(policy.observation_clip).any():
+        most = np.broadcast_to(policy.observation_clip, policy.observation_scale.shape)
+        x = graph.node("Max", graph.node("Min", x, graph.constant(most)), graph.constant(-most))
     x = graph.node("Mul", x, graph.constant(policy.observation_scale))
     if policy.body_frame:
         x = _in_body_frame(graph, policy.body_frame, x, len(policy.observation_scale))
