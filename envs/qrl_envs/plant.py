@@ -175,7 +175,7 @@ class Flight(NamedTuple):
     world: World
     sensed: Body  # the body as measured
     previous_action: chex.Array  # [N] applied
-    integral_m_s: chex.Array  # [k] of the position error along the integrator's axes
+    integral_m_s: chex.Array | tuple[()]  # [k] of the position error along the integrator's axes; (): not integrated
     steps: chex.Array  # int32 []
     history: History | tuple[()] = ()  # of positions, with `sensors.Fixes`
     gust: chex.Array | tuple[()] = ()  # [2] along world x and y, of its standard deviation; with `Gust`
@@ -226,7 +226,7 @@ def begin(
         sensed=sensed,
         previous_action=jnp.zeros(motors),
         integral_m_s=integrated(
-            jnp.zeros(integrator.size if integrator else 0), sensed.pose.position_m - origin_m, integrator, dt_s
+            jnp.zeros(integrator.size) if integrator else (), sensed.pose.position_m - origin_m, integrator, dt_s
         ),
         steps=jnp.int32(0),
         history=history,
@@ -336,8 +336,8 @@ def _renormalized(body: Body) -> Body:
     )
 
 
-def integrated(total: chex.Array, position_m: chex.Array, integrator: Integrator | None, dt_s: float) -> chex.Array:
-    """The integral [k] after a period at `position_m` [3] (`task.Integral`)."""
+def integrated(total: Any, position_m: chex.Array, integrator: Integrator | None, dt_s: float) -> Any:
+    """The integral [k] after a period at `position_m` [3] (`task.Integral`); `total` as it is without an integrator."""
     if integrator is None:
         return total
     x, y, z = jnp.unstack(position_m)
@@ -356,7 +356,8 @@ def observe(flight: Flight, previous_action: bool, target: Target | None = None)
     """What a policy observes: the measured body [18], relative to the target if there is one, then the target's preview
     [3k], then its memory: previous action [N], integral [k].
     """
-    memory = [flight.previous_action, flight.integral_m_s][0 if previous_action else 1 :]
+    memory = [flight.previous_action] if previous_action else []
+    memory += [] if isinstance(flight.integral_m_s, tuple) else [flight.integral_m_s]
     if target is None:
         return jnp.concatenate([quadrotor.observe(flight.sensed), *memory])
     return jnp.concatenate([quadrotor.observe(relative(flight.sensed, target)), target.preview_m_s, *memory])

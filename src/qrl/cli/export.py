@@ -2,7 +2,7 @@
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun, flown_inputs
-from qrl.export import betaflight, crazyflie, emit, vectors
+from qrl.export import betaflight, crazyflie, emit, px4, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
 from qrl.export.kernel import Ints, Kernel
@@ -54,6 +54,8 @@ def export(args: argparse.Namespace) -> int:
     duration = clock(time.perf_counter() - start_time)
     if (run.folder / "export" / crazyflie.FOLDER).is_dir():
         console.print(f"Crazyflie: {run.folder / 'export' / crazyflie.FOLDER} is an app for its firmware")
+    if (run.folder / "export" / px4.FOLDER).is_dir():
+        console.print(f"PX4: {run.folder / 'export' / px4.FOLDER / px4.FILE} is for its module mc_raptor")
     console.print(f"done in {duration}: {run.folder / 'export'}/{name}.c, .h, report.md")
     return DONE
 
@@ -91,12 +93,13 @@ def export_run(
         _write(folder, emitted)
         for adapter in (crazyflie, betaflight):
             _write(folder, adapter.files(policy, emitted, name))
+        _write(folder, px4.files(policy, name))
         (folder / f"{name}.onnx").write_bytes(portable.onnx_model(policy))
         (folder / f"{name}.npz").write_bytes(portable.arrays(policy))
         log("compiling and verifying; flying")
         verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)
-        sections = "".join(adapter.section(policy) for adapter in (crazyflie, betaflight))
+        sections = "".join(adapter.section(policy) for adapter in (crazyflie, betaflight, px4))
         _write(folder, {"report.md": report(policy, kernel, measured, name) + sections})
         previous = Path(scratch) / "previous"
         if target.exists():
@@ -118,11 +121,11 @@ def integer_kernel(run: TrainedRun, policy: Policy) -> Kernel:
         raise BadInput(f"{run.folder}: {error}") from None
 
 
-def _write(folder: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
+def _write(folder: Path, files: Mapping[str, str | bytes]) -> None:
+    for name, data in files.items():
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        path.write_bytes(data.encode() if isinstance(data, str) else data)
 
 
 def _measured(
