@@ -1,0 +1,168 @@
+"""The checkpoint that PX4's module mc_raptor loads from its SD card, of a policy of RAPTOR's shape (docs/px4.md).
+
+A tar file of the archive format ustar, as RLtools (Eschmann et al.) writes and reads it: for each tensor an entry
+`…/meta` of lines `key: value` and an entry `…/data`, little-endian float32, row-major. Facts of PX4 are those of
+`src/modules/mc_raptor` of its main branch before v1.18, of RLtools those of its commit 9acdf5c.
+"""
+
+import io
+import re
+import tarfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from qrl.export import crazyflie
+from qrl.export.policy import Policy, sigmoid
+
+TEMPLATE = Path(__file__).parent / "firmware" / "px4" / "README.md"
+FOLDER, FILE = "px4", "policy.tar"
+RELEASE = "v1.18"
+HIDDEN, UNITS = 16, 16
+PERIOD_S = 0.01  # at which mc_raptor steps the memory
+# Its inputs, of qrl's: position, rotation matrix, velocity, body rates; then the previous action, by motor.
+ORDER = (*range(9, 12), *range(9), *range(12, 18))
+LIMITS = (slice(9, 12), 0.5), (slice(12, 15), 1.0)  # at which it clips the errors [m], [m/s]
+STEPS, FLIGHTS = 500, 2  # of the example; mc_raptor compares the first 5 steps of both
+MOST_ERROR = 1e-5  # mean absolute, in a in [−1, 1], at which it refuses a checkpoint
+MOST_NAME = 99
+Floats = NDArray[np.floating]
+
+
+def refusal(policy: Policy) -> str | None:
+    """Why mc_raptor cannot fly a policy, in one line; None if it can."""
+    memory = policy.memory
+    measured = [port.name for port in policy.observations] == crazyflie.MEASURED
+    if not measured or policy.body_frame or not memory or not memory.previous_action or memory.integral:
+        return "the inputs are not a vehicle's state in the world's frame and the previous action (as of TASK=raptor)"
+    shape = tuple(weight.shape for weight, _ in policy.layers)
+    if shape != ((22, HIDDEN), (UNITS, 4)) or memory.units != UNITS or policy.activation != "relu":
+        return f"the network is not 22 inputs, {HIDDEN} ReLU, a gated recurrent unit of {UNITS}, 4 outputs"
+    if not crazyflie.any_vehicle(policy):
+        return "the actions are not rotor speeds"
+    if round(policy.control_period_s, 9) != PERIOD_S:
+        return f"the control period is {policy.control_period_s * 1e3:g} ms, and mc_raptor's {PERIOD_S * 1e3:g} ms"
+    limits = np.broadcast_to(policy.observation_clip / policy.observation_gain, 22)
+    for part, most in LIMITS:
+        if not np.allclose(limits[part], most):
+            return f"its inputs {part.start + 1} to {part.stop} are not clipped at {most:g}, as mc_raptor does"
+    if np.isfinite(np.delete(limits, np.r_[9:15])).any():
+        return "inputs are clipped that mc_raptor does not clip"
+    order = crazyflie.motor_order(policy)
+    return f"the motors are not those of PX4's quadrotor X: {order}" if isinstance(order, str) else None
+
+
+def tensors(policy: Policy) -> dict[str, NDArray[np.float32]]:
+    """The parameters by name, for inputs and outputs in mc_raptor's order and units: actions in [−1, 1].
+
+    No `refusal`.
+    """
+    motors = crazyflie.motor_order(policy)
+    assert not isinstance(motors, str), motors
+    (weight, bias), (last, last_bias) = policy.layers
+    unit = policy.unit
+    assert unit
+    gain = policy.observation_gain * policy.observation_scale
+    scale, offset = np.ones(22), np.zeros(22)  # of an input in SI units, of that in mc_raptor's
+    scale[18:], offset[18:] = policy.scale, policy.offset
+    bias = bias + ((offset - policy.observation_offset) * gain) @ weight
+    inputs = [*ORDER, *(18 + motor for motor in motors)]
+    named = {
+        "0/weights": (weight * (scale * gain)[:, None]).T[:, inputs],
+        "0/biases": bias,
+        "1/weights_input": unit.of_input[0].T,
+        "1/biases_input": unit.of_input[1],
+        "1/weights_hidden": unit.of_memory[0].T,
+        "1/biases_hidden": unit.of_memory[1],
+        "1/initial_hidden_state": np.zeros(UNITS),
+        "2/weights": last.T[motors],
+        "2/biases": last_bias[motors],
+    }
+    return {name: np.ascontiguousarray(values, np.float32) for name, values in named.items()}
+
+
+def example(policy: Policy) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inputs [STEPS, FLIGHTS, 22] and outputs [STEPS, FLIGHTS, 4] of mc_raptor's policy, from a reset on."""
+    motors = crazyflie.motor_order(policy)
+    assert not isinstance(motors, str), motors
+    rows = np.resize(policy.calibration[:, :22], (STEPS * FLIGHTS, 22)).astype(np.float64)
+    rows[:, 18:] = (rows[:, 18:] - policy.offset) / policy.scale
+    for part, most in LIMITS:
+        rows[:, part] = np.clip(rows[:, part], -most, most)
+    x = rows[:, [*ORDER, *(18 + motor for motor in motors)]].astype(np.float32).reshape(STEPS, FLIGHTS, 22)
+    return x, outputs(tensors(policy), x)
+
+
+def outputs(parameters: dict[str, NDArray[np.float32]], x: Floats) -> NDArray[np.float32]:
+    """What RLtools makes of `tensors` for inputs [T, n, 22]: actions [T, n, 4], not clipped."""
+    w = {name: values.astype(np.float64) for name, values in parameters.items()}
+    h, found = np.tile(w["1/initial_hidden_state"], (x.shape[1], 1)), []
+    for now in x.astype(np.float64):
+        seen = np.maximum(now @ w["0/weights"].T + w["0/biases"], 0.0)
+        own = np.split(h @ w["1/weights_hidden"].T + w["1/biases_hidden"], 3, axis=-1)
+        given = np.split(seen @ w["1/weights_input"].T + w["1/biases_input"], 3, axis=-1)
+        r, z = sigmoid(given[0] + own[0]), sigmoid(given[1] + own[1])
+        h = z * h + (1.0 - z) * np.tanh(given[2] + r * own[2])
+        found.append(h @ w["2/weights"].T + w["2/biases"])
+    return np.array(found, np.float32)
+
+
+def archive(policy: Policy, name: str) -> bytes:
+    """The file's contents; mc_raptor prints `name` as that of the checkpoint."""
+    x, y = example(policy)
+    kinds = {"0": "activation_function: RELU\ntype: dense\n", "1": "type: gru\n"}
+    kinds["2"] = "activation_function: IDENTITY\ntype: dense\n"
+    entries = {"actor/meta": f"checkpoint_name: {_one_line(name)}\ntype: sequential\n".encode()}
+    for path, values in tensors(policy).items():
+        entries |= _tensor(f"actor/layers/{path}/parameters", values)
+    entries |= {f"actor/layers/{layer}/meta": kind.encode() for layer, kind in kinds.items()}
+    entries |= _tensor("example/input", x) | _tensor("example/output", y)
+    file = io.BytesIO()
+    with tarfile.open(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for path, data in entries.items():
+            entry = tarfile.TarInfo(path)  # of no time, so that the same policy gives the same bytes
+            entry.size = len(data)
+            tar.addfile(entry, io.BytesIO(data))
+    return file.getvalue()
+
+
+def _one_line(name: str) -> str:
+    return re.sub(r"[^\x20-\x7e]", "_", name)[:MOST_NAME]
+
+
+def _tensor(path: str, values: NDArray[np.float32]) -> dict[str, bytes]:
+    lines = ["type: tensor", "dtype: float32", f"num_dims: {values.ndim}"]
+    lines += [f"dim_{i}: {size}" for i, size in enumerate(values.shape)]
+    return {f"{path}/meta": "".join(f"{line}\n" for line in lines).encode(), f"{path}/data": values.astype("<f4").tobytes()}
+
+
+def files(policy: Policy, name: str) -> dict[str, bytes]:
+    """Path in the export folder -> contents; none with a `refusal`."""
+    if refusal(policy):
+        return {}
+    values = {"name": name, "release": RELEASE, "facts": "\n".join(f"- {fact}" for fact in facts(policy))}
+    readme = re.sub(r"@(\w+)@", lambda match: values[match[1]], TEMPLATE.read_text(encoding="utf-8"))
+    run = f"{policy.provenance.run} {policy.provenance.env_steps} {name}"
+    return {f"{FOLDER}/{FILE}": archive(policy, run), f"{FOLDER}/README.md": readme.encode()}
+
+
+def facts(policy: Policy) -> list[str]:
+    """What to know of the policy before flight, a sentence each."""
+    run = policy.provenance
+    return [
+        f"{' '.join(run.task.split())}: {' '.join(run.description.split())}.",
+        "It holds a place or follows `trajectory_setpoint`; it sees no set-point ahead, and lags one that moves.",
+        "It has no integral: what it cannot tell from its memory, such as wind, it flies at an offset.",
+        "The commands stand for rotor speeds, from 0 to the greatest: motors that are linear in speed, no thrust curve"
+        " (`THR_MDL_FAC` 0).",
+    ]
+
+
+def section(policy: Policy) -> str:
+    """What report.md says of it; nothing of a policy that flies no vehicle."""
+    if any(port.spin is None for port in policy.actions):
+        return ""
+    reason = refusal(policy)
+    said = f"No {FILE}: {reason}." if reason else f"`{FOLDER}/{FILE}` is for mc_raptor; the README there says how to fly."
+    return f"\n## PX4\n\n{said}\n"
