@@ -167,8 +167,8 @@ def corner(position_m: Sequence[float] | None) -> tuple[int, int]:
 class World:
     """A vehicle in the plant, nothing of it uncertain; n flights at once."""
 
-    def __init__(self, vehicle: Vehicle) -> None:
-        self.vehicle = vehicle
+    def __init__(self, vehicle: Vehicle, step_s: float = STEP_S) -> None:
+        self.vehicle, self.step_s = vehicle, step_s
         physics = quadrotor.physics(vehicle)
         world = plant.draw(
             plant.ranges(Uncertainty(), vehicle), physics, jnp.full(plant.DRAWS + len(vehicle.motors), 0.5)
@@ -185,7 +185,7 @@ class World:
                 speed,
                 (set_point, set_point),
                 late_s,
-                STEP_S,
+                step_s,
             )
             return jnp.concatenate(
                 [body.pose.position_m, body.twist.velocity_m_s, body.pose.attitude, body.twist.body_rate_rad_s, speed]
@@ -202,18 +202,18 @@ class World:
         return np.concatenate([state, np.tile(self.vehicle.hover_speeds, (len(state), 1))], axis=1).astype(np.float32)
 
     def step(self, flights: NDArray[np.float32], thrust_N: Floats) -> NDArray[np.float32]:
-        """1 ms under thrusts [n, motors]."""
+        """One step under thrusts [n, motors]."""
         return np.asarray(self._step(flights, np.minimum(thrust_N, self.max_N).astype(np.float32)))
 
 
 def flown(
     world: World, start: Floats, seconds: float, thrust_N: Ordered, follow: Callable[[float], Reference] | None = None
 ) -> Floats:
-    """States [ms, n, 13] from `start` [n, 13]; `follow(t)`: the reference, at rest without."""
+    """States [steps, n, 13] from `start` [n, 13]; `follow(t)`: the reference, at rest without."""
     flights = world.begin(start)
     found = [start]
-    for step in range(round(seconds / STEP_S)):
-        ordered = thrust_N(step, found[-1], follow(step * STEP_S) if follow else REST)
+    for step in range(round(seconds / world.step_s)):
+        ordered = thrust_N(step, found[-1], follow(step * world.step_s) if follow else REST)
         flights = world.step(flights, ordered)
         found.append(flights[:, :13].astype(np.float64))
     return np.stack(found)

@@ -222,3 +222,21 @@ def test_the_policy_sees_the_first_numbers_and_the_critic_all(normalize: bool) -
     assert np.abs(learner.mean(state, data.observation.at[..., :3].add(1.0)) - mean).max() > 1e-4
     values = [losses(learner, x) for x in (data, hidden)]
     assert values[0][1] != values[1][1]
+
+
+def test_observations_are_clipped_at_their_limits_before_their_factor() -> None:
+    """Those that have one, of the critic's input, too; of the policy's, which is shorter, likewise."""
+    learner = BoundLearner(config(observation_scale=[3.0] * F, observation_limit=[None, 0.5, 0.25]), F, A, None, 2)
+    data = batch()
+    state = begin(learner, data)
+    literal = np.array(data.observation)
+    assert np.abs(literal[..., 1:3]).max() > 1.0
+    for i, most in ((1, 0.5), (2, 0.25)):
+        literal[..., i] = np.minimum(np.maximum(literal[..., i], -most), most)
+    np.testing.assert_allclose(learner.preprocess(state, data.observation), 3.0 * literal, rtol=1e-6)
+    np.testing.assert_array_equal(learner.mean(state, data.observation), learner.mean(state, jnp.asarray(literal)))
+    np.testing.assert_array_equal(
+        learner.preprocess(state, data.observation[..., :2]), learner.preprocess(state, jnp.asarray(literal[..., :2]))
+    )
+    with pytest.raises(ValueError, match="expected normalize_observations false with observation_limit"):
+        config(normalize_observations=True, observation_limit=[1.0])

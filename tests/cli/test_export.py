@@ -174,29 +174,35 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "vehicle", "inputs"), [("circle", ["--vehicle", "crazyflie"], 12 + 4 + 5), ("any", [], 15 + 9 + 4 + 3)]
+    ("task", "vehicle", "inputs"),
+    [("circle", ["--vehicle", "crazyflie"], 12 + 4 + 5), ("any", [], 15 + 9 + 4 + 3), ("raptor", [], 18 + 4)],
 )
-def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], inputs: int, tmp_path: Path) -> None:
-    """With all memory: the policy is the one of the checkpoint. With a preview, a recurrent unit, and actions that are
-    rotor speeds, the kernel is verified too: circle's integral and forces are no other code from there on.
+def test_a_policy_with_all_that_a_task_gives_it_exports(
+    task: str, vehicle: list[str], inputs: int, tmp_path: Path
+) -> None:
+    """With all memory, in the body frame or with limits on what it is given: the policy is the one of the checkpoint.
+    With a preview, a recurrent unit, and actions that are rotor speeds, the kernel is verified too: circle's integral
+    and forces are no other code from there on.
     """
     run = untrained(tmp_path / "run", task, *vehicle)
     loaded = TrainedRun.load(run)
     policy = loaded.float_policy()
-    assert policy.body_frame
-    assert policy.body_frame.last
-    assert policy.memory
-    assert policy.memory.integral
-    assert policy.memory.integral.circle_m == (1.0 if task == "circle" else None)
+    assert (policy.body_frame is None) == (task == "raptor")
+    if policy.body_frame:
+        assert policy.body_frame.last
+        assert policy.memory
+        assert policy.memory.integral
+        assert policy.memory.integral.circle_m == (1.0 if task == "circle" else None)
     assert len(policy.layers[0][0]) == inputs
     said = {(port.unit, port.quantity) for port in policy.actions}
-    assert said == ({("1", "rotor speed fraction")} if task == "any" else {("N", None)})
+    assert said == ({("N", None)} if task == "circle" else {("1", "rotor speed fraction")})
     env: Any = loaded.env
     seen = np.array(jax.jit(jax.vmap(env.reset))(jax.random.split(jax.random.PRNGKey(0), 20)).obs)
-    remembered = slice(policy.body_frame.measured, env.policy_observation_size)
+    assert np.abs(seen[:, 9:12]).max() > 0.5
+    remembered = slice(len(policy.observations), env.policy_observation_size)
     seen[:, remembered] = np.random.default_rng(0).uniform(-0.5, 0.5, seen[:, remembered].shape)
-    units = policy.memory.units
-    assert bool(units) == (task == "any")
+    units = policy.memory.units if policy.memory else 0
+    assert bool(units) == (task != "circle")
     h = np.random.default_rng(1).uniform(-0.9, 0.9, (20, units))
     after, action = jax.jit(loaded.act)(jnp.asarray(h) if units else (), seen)
     wanted = policy.to_si(np.asarray(action))
@@ -209,11 +215,14 @@ def test_a_policy_in_the_body_frame_exports(task: str, vehicle: list[str], input
     assert qrl("export", run, *LEAST) == 0
     manifest = json.loads((run / "export" / "manifest.json").read_text())
     assert manifest["network"][0] == inputs
-    # Calibrated on the motion of training, not on the eight that is evaluated: there 1.3 m/s.
-    assert max(port["range"][1] for port in manifest["obs"] if "ahead_s" in port) > 1.8
-    assert {(port["unit"], port["quantity"]) for port in manifest["act"]} == said
+    if task == "any":  # calibrated on the motion of training, not on the eight that is evaluated: there 1.3 m/s
+        assert max(port["range"][1] for port in manifest["obs"] if "ahead_s" in port) > 1.8
+        assert manifest["memory"]["integral"]["circle_m"] is None
+    assert {port["quantity"] for port in manifest["act"]} == {"rotor speed fraction"}
     assert {path.name for path in (run / "export" / "crazyflie" / "src").iterdir()} > {manifest["name"] + ".c"}
     assert "`crazyflie/` is an app" in (run / "export" / "report.md").read_text()
+    assert (run / "export" / "px4" / "policy.tar").exists() == (task == "raptor")
+    assert ("No policy.tar: the inputs" in (run / "export" / "report.md").read_text()) == (task != "raptor")
 
 
 @pytest.mark.parametrize("name", shipped_vehicles())

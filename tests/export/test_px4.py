@@ -60,9 +60,9 @@ def shaped(seed: int = 0) -> Policy:
 
 
 def read(data: bytes) -> dict[str, bytes]:
-    """Entries as RLtools finds them: blocks of 512 bytes, names of up to 100, sizes in octal, to a block of zeros."""
+    """Entries as RLtools finds them: blocks of 512 bytes, names of up to 100, sizes in octal, to a block of zeros or the end."""
     found, at = {}, 0
-    while data[at] != 0:
+    while at < len(data) and data[at] != 0:
         name, size, magic = struct.unpack("100s24x12s121x5s", data[at : at + 262])
         assert magic == b"ustar"
         size = int(size.rstrip(b"\0 "), 8)
@@ -103,9 +103,10 @@ def test_layout_is_that_of_raptors_own_file() -> None:
     data = px4.archive(shaped(), "a name\nof two lines" + "é" * 200)
     entries = read(data)
     assert {path: tensor(entries, path).shape for path in SHAPES} == SHAPES
-    others = {name: text.decode() for name, text in entries.items() if not name.rpartition("/")[0] in SHAPES}
+    others = {name: text.decode() for name, text in entries.items() if name.rpartition("/")[0] not in SHAPES}
     first, kind = others.pop("actor/meta").splitlines()
-    assert first.startswith("checkpoint_name: a name_of two lines_") and len(first) < 120
+    assert first.startswith("checkpoint_name: a name_of two lines_")
+    assert len(first) < 120
     assert kind == "type: sequential"
     assert others == {
         "actor/layers/0/meta": "activation_function: RELU\ntype: dense\n",

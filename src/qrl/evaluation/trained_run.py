@@ -210,7 +210,9 @@ class TrainedRun:
             actions=actions,
             observation_offset=offset_si + scale_si * mean,
             observation_gain=gain / scale_si,
-            observation_clip=np.full(size, MAX_NORMALIZED) if normalize else config.observation_limits(size).astype(float),
+            observation_clip=np.full(size, MAX_NORMALIZED)
+            if normalize
+            else config.observation_limits(size).astype(float),
             observation_scale=np.asarray(config.observation_scale or np.ones(size))[:size],
             layers=layers,
             activation=config.activation,

@@ -134,7 +134,10 @@ def _one_line(name: str) -> str:
 def _tensor(path: str, values: NDArray[np.float32]) -> dict[str, bytes]:
     lines = ["type: tensor", "dtype: float32", f"num_dims: {values.ndim}"]
     lines += [f"dim_{i}: {size}" for i, size in enumerate(values.shape)]
-    return {f"{path}/meta": "".join(f"{line}\n" for line in lines).encode(), f"{path}/data": values.astype("<f4").tobytes()}
+    return {
+        f"{path}/meta": "".join(f"{line}\n" for line in lines).encode(),
+        f"{path}/data": values.astype("<f4").tobytes(),
+    }
 
 
 def files(policy: Policy, name: str) -> dict[str, bytes]:
@@ -164,5 +167,7 @@ def section(policy: Policy) -> str:
     if any(port.spin is None for port in policy.actions):
         return ""
     reason = refusal(policy)
-    said = f"No {FILE}: {reason}." if reason else f"`{FOLDER}/{FILE}` is for mc_raptor; the README there says how to fly."
+    said = (
+        f"No {FILE}: {reason}." if reason else f"`{FOLDER}/{FILE}` is for mc_raptor; the README there says how to fly."
+    )
     return f"\n## PX4\n\n{said}\n"
