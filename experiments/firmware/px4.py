@@ -44,7 +44,7 @@ Tensors = dict[str, NDArray[np.float32]]
 
 
 def build(tree: Path, folder: Path, *mutants: Mutant) -> Path:
-    """The module's library in `folder`, whose `sd` is its SD card; ValueError if a mutant's text is not in its source."""
+    """The module's library in `folder`, whose `sd` is its SD card; ValueError if a mutant's text is not there."""
     source = (tree / MODULE / "mc_raptor.cpp").read_text(encoding="utf-8")
     for mutant in mutants:
         if mutant.old not in source:
@@ -184,7 +184,7 @@ def loads(module: Module, policy: Policy) -> Iterator[str]:
     apart = np.abs(np.clip(module.respond(np.array(inputs)), -1.0, 1.0) - wanted).max()
     yield f"mc_raptor loads the checkpoint '{module.name()}', and its own test passes"
     verdict = "ok" if apart < SAME_OUTPUT else "FAILED"
-    yield f"RLtools' outputs beside the policy's, 500 steps: at most {apart:.1e} apart (limit {SAME_OUTPUT:g}): {verdict}"
+    yield f"RLtools' outputs are at most {apart:.1e} from the policy's, 500 steps (limit {SAME_OUTPUT:g}): {verdict}"
 
 
 def beside_the_policy(world: World, module: Module, policy: Policy, n: int, seconds: float) -> str:
@@ -210,7 +210,7 @@ def rules(world: World, module: Module, n: int) -> Iterator[str]:
     )
     there = states[round(2.2 / world.step_s), :, :3]
     moved = np.linalg.norm(states[-round(1.0 / world.step_s) :, :, :3] - there, axis=-1).max()
-    yield f"set-points stop after 2 s: at most {moved:.2f} m from where it was then, at 5 to 6 s; {fell(states).sum()} fell"
+    yield f"set-points stop after 2 s: at 5 to 6 s at most {moved:.2f} m from there; {fell(states).sum()} fell"
     for what, limit_ms, place in (("local position", 100, 0), ("attitude", 50, 1)):
         vehicle, row, published = module.boot(), numbers(loop.starts(1), asked(0.0))[0], []
         for step in range(200):
@@ -221,46 +221,53 @@ def rules(world: World, module: Module, n: int) -> Iterator[str]:
         yield f"no {what}: orders stop {late_ms:.1f} ms after the last (its limit: {limit_ms} ms)"
 
 
+SIGNS = "+--"  # of x, y, z from PX4's frames to RAPTOR's, in the module's source
+RATE, QUATERNION = "= {1}_vehicle_angular_velocity.xyz[{0}];", "qr[{0}] = {1}_vehicle_attitude.q[{2}];"
+POSITION = "p[{0}] = {1}(position[{0}] - _trajectory_setpoint.position[{0}]);"
+VELOCITY = "v[{0}] = {1}(linear_velocity[{0}]"
+YAW, REMAP = "0.5f * _trajectory_setpoint.yaw", "temp.control[{}] = actuator_motors.control[{}];"
+REMAPPED = (0, 2, 3, 1)
+
+
 def in_source() -> dict[str, tuple[Mutant, ...]]:
     """Mistakes in the module's source: what it would be to be made for other units, orders or signs."""
-    rate, position = (
-        "= {}_vehicle_angular_velocity.xyz[{}];",
-        "p[{0}] = {1}(position[{0}] - _trajectory_setpoint.position[{0}]);",
-    )
 
     def one(old: str, new: str) -> tuple[Mutant, ...]:
         return (Mutant(old, new),)
 
-    found = {
-        f"body rate {axis} the other way": one(rate.format(sign, i), rate.format("-+"[sign == "-"], i))
-        for i, (axis, sign) in enumerate(zip("xyz", "+--", strict=True))
-    }
-    found |= {
-        f"position {axis} the other way": one(position.format(i, sign), position.format(i, "-+"[sign == "-"]))
-        for i, (axis, sign) in enumerate(zip("xyz", "+--", strict=True))
-    }
-    qr = "qr[{0}] = {1}_vehicle_attitude.q[{2}];"
-    order = tuple(Mutant(qr.format(i, sign, i), qr.format(i, sign, (i + 1) % 4)) for i, sign in enumerate("++--"))
-    mirrored = tuple(Mutant(qr.format(i, "-", i), qr.format(i, "+", i)) for i in (2, 3))
-    rates = tuple(Mutant(rate.format(sign, i), rate.format(f"{sign}57.3f * ", i)) for i, sign in enumerate("+--"))
-    remap = "temp.control[{}] = actuator_motors.control[{}];"
-    found |= {
-        "body rates in deg/s": rates,
-        "quaternion x y z w": order,
-        "attitude left in forward-right-down": mirrored,
-        "attitude conjugated": tuple(Mutant(qr.format(i, s, i), qr.format(i, "+-"[s == "+"], i)) for i, s in ((1, "+"), (2, "-"), (3, "-"))),
-        "velocity the other way": tuple(Mutant(f"v[{i}] = {s}(linear", f"v[{i}] = {'+-'[s == '+']}(linear") for i, s in enumerate("+--")),
-        "heading ignored": one("0.5f * _trajectory_setpoint.yaw", "0.0f * _trajectory_setpoint.yaw"),
-        "heading the other way": one("0.5f * _trajectory_setpoint.yaw", "-0.5f * _trajectory_setpoint.yaw"),
-        "motors not remapped": one("if constexpr(Raptor::REMAP_FROM_CRAZYFLIE)", "if constexpr(false)"),
-        "motors 3 and 4 swapped": (*one(remap.format(2, 3), remap.format(2, 1)), *one(remap.format(3, 1), remap.format(3, 3))),
-        "motors mirrored: spins reversed": (
-            *(Mutant(remap.format(i, old), remap.format(i, new)) for i, old, new in ((0, 0, 3), (1, 2, 1), (2, 3, 0), (3, 1, 2))),
+    def turned(form: str, *axes: int) -> tuple[Mutant, ...]:
+        """With the other sign along these axes."""
+        return tuple(Mutant(form.format(i, SIGNS[i]), form.format(i, "-+"[SIGNS[i] == "-"])) for i in axes)
+
+    def attitude(*changed: tuple[int, str, int]) -> tuple[Mutant, ...]:
+        """qr[i] of another sign or of another number."""
+        return tuple(
+            Mutant(QUATERNION.format(i, "++--"[i], i), QUATERNION.format(i, sign, j)) for i, sign, j in changed
+        )
+
+    def motors(*places: int) -> tuple[Mutant, ...]:
+        """PX4's motors given these of RAPTOR's."""
+        pairs = enumerate(zip(REMAPPED, places, strict=True))
+        return tuple(Mutant(REMAP.format(i, old), REMAP.format(i, new)) for i, (old, new) in pairs if old != new)
+
+    return {
+        **{f"body rate {axis} the other way": turned(RATE, i) for i, axis in enumerate("xyz")},
+        "body rates in deg/s": tuple(
+            Mutant(RATE.format(i, sign), RATE.format(i, f"{sign}57.3f * ")) for i, sign in enumerate(SIGNS)
         ),
+        **{f"position {axis} the other way": turned(POSITION, i) for i, axis in enumerate("xyz")},
+        "velocity the other way": turned(VELOCITY, 0, 1, 2),
+        "quaternion x y z w": attitude((0, "+", 1), (1, "+", 2), (2, "-", 3), (3, "-", 0)),
+        "attitude left in forward-right-down": attitude((2, "+", 2), (3, "+", 3)),
+        "attitude conjugated": attitude((1, "-", 1), (2, "+", 2), (3, "+", 3)),
+        "heading ignored": one(YAW, YAW.replace("0.5", "0.0")),
+        "heading the other way": one(YAW, f"-{YAW}"),
+        "motors not remapped": one("if constexpr(Raptor::REMAP_FROM_CRAZYFLIE)", "if constexpr(false)"),
+        "motors 3 and 4 swapped": motors(0, 2, 1, 3),
+        "motors mirrored: spins reversed": motors(3, 1, 0, 2),
         "commands not halved": one("value = (value + 1) / 2;", "value = value + 1;"),
         "memory at each sample": one("imu_gyro_ratemax / POLICY_CONTROL_FREQUENCY_TRAINING;", "1;"),
-    }  # fmt: skip
-    return found
+    }
 
 
 def in_checkpoint(policy: Policy) -> dict[str, Callable[[Tensors], Tensors]]:
@@ -271,6 +278,11 @@ def in_checkpoint(policy: Policy) -> dict[str, Callable[[Tensors], Tensors]]:
 
     def change(name: str, what: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> Callable[[Tensors], Tensors]:
         return lambda made: made | {name: np.ascontiguousarray(what(made[name]))}
+
+    by_columns = [0, 1, 2, 3, 6, 9, 4, 7, 10, 5, 8, 11, *range(12, 22)]
+
+    def by_gate(weights: NDArray[np.float32]) -> NDArray[np.float32]:
+        return np.concatenate([part.T for part in np.split(weights, 3)])
 
     def gates(made: Tensors) -> Tensors:
         order = np.r_[16:32, 0:16, 32:48]
@@ -288,15 +300,15 @@ def in_checkpoint(policy: Policy) -> dict[str, Callable[[Tensors], Tensors]]:
 
     return {
         "inputs in qrl's order": change("0/weights", lambda w: w[:, home]),
-        "rotation matrix by columns": change("0/weights", lambda w: w[:, [0, 1, 2, 3, 6, 9, 4, 7, 10, 5, 8, 11, *range(12, 22)]]),
+        "rotation matrix by columns": change("0/weights", lambda w: w[:, by_columns]),
         "weights column-major": change("0/weights", lambda w: w.T.reshape(w.shape)),
         "gates z, r, n": gates,
-        "memory's weights transposed": change("1/weights_hidden", lambda w: np.concatenate([part.T for part in np.split(w, 3)])),
+        "memory's weights transposed": change("1/weights_hidden", by_gate),
         "no bias of the gates": change("1/biases_input", np.zeros_like),
         "motors in the file's order": own_motors,
         "previous action of another scale": halved,
         "outputs of another sign": change("2/weights", np.negative),
-    }  # fmt: skip
+    }
 
 
 def mistakes(

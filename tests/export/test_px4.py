@@ -60,7 +60,7 @@ def shaped(seed: int = 0) -> Policy:
 
 
 def read(data: bytes) -> dict[str, bytes]:
-    """Entries as RLtools finds them: blocks of 512 bytes, names of up to 100, sizes in octal, to a block of zeros or the end."""
+    """Entries as RLtools finds them: blocks of 512 bytes, names of up to 100, sizes in octal, to zeros or the end."""
     found, at = {}, 0
     while at < len(data) and data[at] != 0:
         name, size, magic = struct.unpack("100s24x12s121x5s", data[at : at + 262])
