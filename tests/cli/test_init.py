@@ -90,6 +90,7 @@ def test_another_policy_in_its_place_is_refused(
         (["hover"], "world"),
         (["pendulum", "--policy-hidden-layer-sizes", "[8]"], "policy_hidden_layer_sizes"),
         (["pendulum", "--observation-scale", "[1, 1, 1]"], "observation_scale"),
+        (["pendulum", "--observation-limit", "[null, 0.5]"], "observation_limit"),
     ],
 )
 def test_what_its_network_does_not_fit_is_refused(

@@ -102,7 +102,8 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
         console.print(f"environment changed since the run began; results may not be bit-identical: {changed}")
     for warning in tasks.spec(config.task).warnings() if config.task.spec else []:
         print_error(f"warning: {config.task.name}: {warning}")
-    where = "command line" if "observation_scale" in flags else str(args.config or config.task.name)
+    given = {"observation_scale", "observation_limit"} & {*flags}
+    where = "command line" if given else str(args.config or config.task.name)
     env = tasks.environment(config.task)
     if first:
         initial.check(first, config, env)
