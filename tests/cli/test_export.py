@@ -174,17 +174,21 @@ def test_a_policy_with_memory_is_the_one_that_was_trained(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "vehicle", "inputs"),
-    [("circle", ["--vehicle", "crazyflie"], 12 + 4 + 5), ("any", [], 15 + 9 + 4 + 3), ("raptor", [], 18 + 4)],
+    ("task", "words", "inputs"),
+    [
+        ("circle", ["--vehicle", "crazyflie"], 12 + 4 + 5),
+        ("any", [], 15 + 9 + 4 + 3),
+        ("raptor", ["--policy-hidden-layer-sizes", "[16]"], 18 + 4),
+    ],
 )
 def test_a_policy_with_all_that_a_task_gives_it_exports(
-    task: str, vehicle: list[str], inputs: int, tmp_path: Path
+    task: str, words: list[str], inputs: int, tmp_path: Path
 ) -> None:
     """With all memory, in the body frame or with limits on what it is given: the policy is the one of the checkpoint.
     With a preview, a recurrent unit, and actions that are rotor speeds, the kernel is verified too: circle's integral
     and forces are no other code from there on.
     """
-    run = untrained(tmp_path / "run", task, *vehicle)
+    run = untrained(tmp_path / "run", task, *words)
     loaded = TrainedRun.load(run)
     policy = loaded.float_policy()
     assert (policy.body_frame is None) == (task == "raptor")
