@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from experiments.arguments import Parser, run_main
 from experiments.firmware import crazyflie_loop as loop
+from experiments.firmware.crazyflie import heading_deg
 from experiments.firmware.crazyflie_loop import Floats, Mutant, Ordered, Reference, World
 from experiments.output import table
 from qrl.cli.main import configure_jax
@@ -315,21 +316,22 @@ def mistakes(
     world: World, tree: Path, folder: Path, library: Path, policy: Policy, n: int
 ) -> Iterator[tuple[str, str, str]]:
     """For each: where it is, its name, and what n flights of it do."""
-    start = loop.starts(n, seed=103, distance_m=0.5, tilt_rad=0.6)
-    goal = asked(0.0).position_m
+    start, wanted = loop.starts(n, seed=103, distance_m=0.5, tilt_rad=0.6), asked(0.0)
     right = px4.archive(policy, "right")
 
     def flown(module: Module) -> Floats:
         return loop.flown(world, start, 5.0, by_module(world, module, n), asked)
 
-    offset = np.linalg.norm(last_second(world, flown(Module(library, right))) - goal, axis=1).max()
+    def off(states: Floats) -> str:
+        distance_m = np.linalg.norm(last_second(world, states) - wanted.position_m, axis=1).max()
+        turned = np.abs((heading_deg(states) - wanted.yaw_deg + 180.0) % 360.0 - 180.0).max()
+        return f"{1e3 * distance_m:.0f} mm and {turned:.1f}°"
+
+    usual = off(flown(Module(library, right)))
 
     def verdict(module: Module) -> str:
         states = flown(module)
-        if fell(states).any():
-            return f"{fell(states).sum()} of {n} fall"
-        off = np.linalg.norm(last_second(world, states) - goal, axis=1).max()
-        return f"{1e3 * off:.0f} mm off, without it {1e3 * offset:.0f}"
+        return f"{fell(states).sum()} of {n} fall" if fell(states).any() else f"{off(states)} off, without it {usual}"
 
     for i, (name, mutants) in enumerate(in_source().items()):
         yield "module", name, verdict(Module(build(tree, folder / f"mutant{i}", *mutants), right))
