@@ -7,10 +7,10 @@ import pytest
 from qrl.export.targets import CORES
 
 M0, M3, M4F, M7, M33, M55, RV32IMC = CORES
-BODIES = M0, M4F, RV32IMC  # one for each body of the template: Armv6-M, Arm DSP, C99
+BODIES = M0, M4F, M55, RV32IMC  # one for each body of the template: Armv6-M, Arm DSP, Helium, C99
 # For the fixture `core`: None is the host.
 EACH = pytest.mark.parametrize("core", CORES, ids=[core.name for core in CORES], indirect=True)
-EITHER = pytest.mark.parametrize("core", [None, *BODIES], ids=["host", "M0", "M4F", "RV32IMC"], indirect=True)
+EITHER = pytest.mark.parametrize("core", [None, *BODIES], ids=["host", "M0", "M4F", "M55", "RV32IMC"], indirect=True)
 
 
 def need(missing: list[str]) -> None:
