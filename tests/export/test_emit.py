@@ -298,9 +298,9 @@ def test_the_example_says_when_its_self_test_fails(exported: Exported, tmp_path:
     assert (folder / SOURCE).read_text() != source
     run("make", "-s", "policy", cwd=folder / EXAMPLE)
     run("./policy", cwd=folder / EXAMPLE)  # the self-test asks for the same safe action
-    bias = re.search(r"BIAS\((-?\d+),", source)
+    bias = re.search(r"\bB4\((-?\d+),", source)
     assert bias
-    (folder / SOURCE).write_text(source.replace(bias[0], f"BIAS({int(bias[1]) + 2**20},", 1))
+    (folder / SOURCE).write_text(source.replace(bias[0], f"B4({int(bias[1]) + 2**20},", 1))
     run("make", "-s", "policy", cwd=folder / EXAMPLE)
     done = subprocess.run(["./policy"], cwd=folder / EXAMPLE, capture_output=True, text=True, check=False)
     assert done.returncode == 1

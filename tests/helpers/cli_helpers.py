@@ -42,7 +42,7 @@ def untrained(out: Path, *words: str | Path) -> Path:
     """The run folder `out` of the random policies that `qrl train words` begins with, for what only flies them: to
     compile a program that trains takes most of a tiny run's time.
     """
-    args = build_parser().parse_args(["train", *map(str, words), "--out", str(out), *TINY.split()])
+    args = build_parser().parse_args(["train", str(words[0]), *TINY.split(), "--out", str(out), *map(str, words[1:])])
     with ExitStack() as locks:
         plan = train.make_plan(args, locks)
         assert plan
