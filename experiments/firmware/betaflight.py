@@ -67,6 +67,8 @@ def main(argv: list[str] | None = None) -> int:
         wrong = {**hooks.mistakes(NAME), **hooks.indiflight_mistakes()}
         if policy.actions[0].quantity:
             del wrong["thrust as speed"]
+        if policy.body_frame:  # mirrored vectors and a mirrored matrix are the same to it
+            del wrong["east for west"]
         for i, (what, mutants) in enumerate(wrong.items()):
             if what in hooks.indiflight_mistakes():
                 vehicles.append((Indiflight(folder, NAME, out / f"mistake{i}", _lax(flags), *mutants), 0))
