@@ -18,10 +18,11 @@ from experiments.firmware import betaflight_loop as hooks
 from experiments.firmware import crazyflie_loop as loop
 from experiments.firmware.betaflight_loop import Hook, Indiflight
 from experiments.firmware.crazyflie_loop import World
+from experiments.firmware.emitted import emitted
 from qrl.cli.main import configure_jax
 from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT
 from qrl.evaluation.trained_run import TrainedRun
-from qrl.export import betaflight, emit, vectors
+from qrl.export.firmware import betaflight
 from qrl.export.quantize import quantize
 from qrl.runs import shipped
 from qrl_envs import task as tasks
@@ -55,12 +56,7 @@ def main(argv: list[str] | None = None) -> int:
     world, kernel = World(task.vehicle), quantize(policy)
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch)
-        for name, text in betaflight.files(
-            policy, emit.files(policy, kernel, vectors.golden(policy, kernel), NAME), NAME
-        ).items():
-            (out / name).parent.mkdir(parents=True, exist_ok=True)
-            (out / name).write_text(text, encoding="utf-8")
-        folder = out / betaflight.FOLDER
+        folder = emitted(betaflight, policy, kernel, out, NAME)
         whole = Hook(folder, NAME, out / "hook")
         vehicles: list[tuple[Hook | Indiflight, int]] = [(whole, whole.boot()) for _ in range(RIGHT)]
         vehicles += [(Indiflight(folder, NAME, out / f"right{i}", flags), 0) for i in range(RIGHT)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.firmware import crazyflie_loop as loop
 from experiments.firmware.crazyflie_loop import Floats, Mutant, World
-from qrl.export import betaflight
+from qrl.export.firmware import betaflight
 
 FLIP = np.array([1.0, -1.0, -1.0])  # front, left, up <-> front, right, down; and of the world
 FLIES, OFF, POSITION_OLD, ATTITUDE_OLD, SETPOINT_OLD, NOT_FINITE, SELFTEST = range(7)
@@ -164,7 +164,7 @@ class Indiflight:
 
 def by_hook(world: World, hooks: Sequence[tuple[Hook | Indiflight, int]]) -> loop.Ordered:
     """Thrusts of each vehicle's hook, called at 1 kHz; none where it does not fly."""
-    corners = [(x, y) for x, y, _ in betaflight.MOTORS]
+    corners = [(motor.x, motor.y) for motor in betaflight.MOTORS]
     order = [corners.index(loop.corner(motor.position_m)) for motor in world.vehicle.motors]
     c, commands = world.vehicle.thrust_curve, np.zeros((len(hooks), 4))
 

@@ -20,11 +20,13 @@ from experiments.firmware import crazyflie_loop as loop
 from experiments.firmware import crazyflie_mistakes as faulty
 from experiments.firmware import crazyflie_protocol as protocol
 from experiments.firmware.crazyflie_loop import App, Firmware, Floats, Reference, World
+from experiments.firmware.emitted import emitted
 from experiments.output import table
 from qrl.cli.main import configure_jax
 from qrl.evaluation.trained_run import TrainedRun
-from qrl.export import crazyflie, emit, vectors
-from qrl.export.crazyflie import PLATFORMS, Platform
+from qrl.export.firmware import crazyflie
+from qrl.export.firmware.crazyflie import PLATFORMS, Platform
+from qrl.export.firmware.vehicle import orders_speeds
 from qrl.export.kernel import Kernel
 from qrl.export.policy import Policy
 from qrl.export.quantize import quantize
@@ -219,18 +221,14 @@ def fly(args: argparse.Namespace) -> int:
     if reason := crazyflie.refusal(policy):
         raise BadInput(f"{args.run}: no app for a Crazyflie: {reason}")
     kernel = quantize(policy)
-    task = tasks.load("hover", args.vehicle or "cf21_brushless") if crazyflie.any_vehicle(policy) else run.task
+    task = tasks.load("hover", args.vehicle or "cf21_brushless") if orders_speeds(policy) else run.task
     assert isinstance(task, QuadrotorTask)
     vehicle = task.vehicle
     build = crazyflie.platform(policy) or min(PLATFORMS, key=lambda p: abs(p.thrust_max_N - vehicle.motors[0].max_N))
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        files = emit.files(policy, kernel, vectors.golden(policy, kernel), NAME)
-        for name, text in (files | crazyflie.files(policy, files, NAME)).items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(text, encoding="utf-8")
         made = firmware(args.firmware, build, folder / "generated")
-        app, world = folder / crazyflie.FOLDER, World(vehicle)
+        app, world = emitted(crazyflie, policy, kernel, folder, NAME), World(vehicle)
         library = loop.build(app, made, folder / "build" / "app.so")
         print(f"compiled for {build.title}: {' '.join(loop.STRICT)}, without warnings")
         wrong = list(protocol.faults(boots(library), policy, kernel))

@@ -27,7 +27,8 @@ from experiments.firmware.crazyflie_loop import Floats, Mutant, Ordered, Referen
 from experiments.output import table
 from qrl.cli.main import configure_jax
 from qrl.evaluation.trained_run import TrainedRun
-from qrl.export import px4
+from qrl.export.firmware import px4
+from qrl.export.firmware.vehicle import by_place_and_spin
 from qrl.export.policy import Policy
 from qrl_envs import task as tasks
 from qrl_envs.specfile import BadInput
@@ -273,7 +274,7 @@ def in_source() -> dict[str, tuple[Mutant, ...]]:
 
 def in_checkpoint(policy: Policy) -> dict[str, Callable[[Tensors], Tensors]]:
     """Mistakes in the checkpoint; what is stored as an example has them too, so that the module loads it."""
-    motors = px4.crazyflie.motor_order(policy)
+    motors = by_place_and_spin(policy, px4.MOTORS)
     assert not isinstance(motors, str)
     back, home = np.argsort(motors), np.argsort([*px4.ORDER, *range(18, 22)])
 
@@ -372,10 +373,7 @@ def fly(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         library = build(args.px4, folder / "right")
-        module, world = (
-            Module(library, px4.files(policy, "policy")[f"{px4.FOLDER}/{px4.FILE}"]),
-            World(task.vehicle, 1.0 / GYRO_HZ),
-        )
+        module, world = Module(library, px4.archive(policy, "policy")), World(task.vehicle, 1.0 / GYRO_HZ)
         print("\n".join(loads(module, policy)), flush=True)
         print(beside_the_policy(world, module, policy, args.starts, args.seconds), flush=True)
         print("\n".join(rules(world, module, 5)), flush=True)

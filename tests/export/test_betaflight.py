@@ -33,8 +33,9 @@ from experiments.firmware.betaflight_loop import (
     set_point,
 )
 from experiments.firmware.crazyflie_loop import World
-from qrl.export import betaflight, emit, vectors
+from experiments.firmware.emitted import emitted as written
 from qrl.export import kernel as integers
+from qrl.export.firmware import betaflight
 from qrl.export.policy import Policy
 from qrl.export.quantize import quantize
 from qrl_envs import task as tasks
@@ -50,12 +51,7 @@ def _compiler() -> None:
 
 
 def emitted(policy: Policy, folder: Path) -> Path:
-    kernel = quantize(policy)
-    files = emit.files(policy, kernel, vectors.golden(policy, kernel), NAME)
-    for name, text in betaflight.files(policy, files, NAME).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8")
-    return folder / betaflight.FOLDER
+    return written(betaflight, policy, quantize(policy), folder, NAME)
 
 
 @cache
@@ -68,7 +64,7 @@ def world() -> World:
 UNFIT = {
     "pendulum": (lambda: policies.policy(policies.PENDULUM), "observation is not"),
     "six motors": (lambda: replace(of_vehicle("crazyflie"), actions=flying("hover", "hexa")), "the policy has 6"),
-    "a corner": (lambda: changed(recurrent(), 1, position_m=(0.03, -0.03)), r"rear right \(1\), and the vehicle 0"),
+    "a corner": (lambda: changed(recurrent(), 1, position_m=(0.03, -0.03)), r"rear right \(1\), and the vehicle has 0"),
     "spins": (lambda: changed(recurrent(), 1, spin=-1), "do not turn as a quad X's do"),
     "unit": (lambda: changed(recurrent(), 2, unit="1", quantity="duty"), "neither thrusts"),
 }

@@ -21,7 +21,9 @@ from experiments.firmware import crazyflie_mistakes as faulty
 from experiments.firmware import crazyflie_protocol as protocol
 from experiments.firmware.crazyflie import NAME, boots, circling, fell, tail
 from experiments.firmware.crazyflie_loop import App, Firmware, Mutant, World
-from qrl.export import crazyflie, emit, vectors
+from experiments.firmware.emitted import emitted as written
+from qrl.export import emit, vectors
+from qrl.export.firmware import crazyflie
 from qrl.export.policy import ActionSpec, Integral, Memory, Policy
 from qrl.export.quantize import quantize
 from qrl_envs import io_spec
@@ -78,12 +80,7 @@ def steady() -> Policy:
 
 def emitted(policy: Policy, folder: Path) -> Path:
     """The app's folder in an export to `folder`."""
-    kernel = quantize(policy)
-    files = emit.files(policy, kernel, vectors.golden(policy, kernel), NAME)
-    for name, text in crazyflie.files(policy, files, NAME).items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_text(text, encoding="utf-8")
-    return folder / crazyflie.FOLDER
+    return written(crazyflie, policy, quantize(policy), folder, NAME)
 
 
 class Built:
@@ -157,13 +154,13 @@ def changed(policy: Policy, index: int, **changes: object) -> Policy:
 UNFIT = {
     "pendulum": (lambda: policies.policy(policies.PENDULUM), "observation is not"),
     "units of its own": (lambda: policies.policy((18, 4, 3)), "observation is not"),
-    "six motors": (lambda: replace(of_vehicle("crazyflie"), actions=flying("hover", "hexa")), "and the policy 6"),
+    "six motors": (lambda: replace(of_vehicle("crazyflie"), actions=flying("hover", "hexa")), "the policy has 6"),
     "heavy": (lambda: of_vehicle("paper"), "hover takes 1.64 N of a motor, and a Crazyflie's have at most 0.2 N"),
     "4.5 ms": (lambda: replace(recurrent(), control_period_s=0.0045), "control period of 4.5 ms is no whole number"),
     "0.5 ms": (lambda: replace(recurrent(), control_period_s=0.0005), "control period of 0.5 ms is no whole number"),
     "spin": (lambda: changed(recurrent(), 1, spin=-1), r"back right \(M2\) has spin \+1, and the vehicle's \(f2\) -1"),
-    "a corner": (lambda: changed(recurrent(), 1, position_m=(0.03, -0.03)), r"right \(M1\), and the vehicle 2"),
-    "plus": (lambda: changed(recurrent(), 1, position_m=(0.0, -0.05)), r"back right \(M2\), and the vehicle 0"),
+    "a corner": (lambda: changed(recurrent(), 1, position_m=(0.03, -0.03)), r"right \(M1\), and the vehicle has 2"),
+    "plus": (lambda: changed(recurrent(), 1, position_m=(0.0, -0.05)), r"back right \(M2\), and the vehicle has 0"),
     "large": (
         lambda: replace(
             recurrent(),

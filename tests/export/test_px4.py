@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import policies
-from qrl.export import px4
+from qrl.export.firmware import px4
 from qrl.export.policy import ActionSpec, BodyFrame, Integral, Memory, Policy
 from qrl_envs import io_spec
 from qrl_envs import task as tasks
@@ -180,11 +180,12 @@ def test_refusals() -> None:
     ]
     for policy, reason in bad:
         assert reason in (px4.refusal(policy) or "")
-        assert px4.files(policy, "x") == {}
+        assert px4.files(policy, {}, "x") == {}
         assert reason in px4.section(policy)
 
 
 def test_the_readme_has_no_placeholder_left() -> None:
-    readme = px4.files(shaped(), "mine")["px4/README.md"].decode()
+    readme = px4.files(shaped(), {}, "mine")["px4/README.md"]
+    assert isinstance(readme, str)
     assert readme.startswith("# mine on PX4")
     assert "@" not in readme

@@ -18,9 +18,10 @@ from qrl.cli.terminal import DONE, clock, console
 from qrl.evaluation import calibration
 from qrl.evaluation.starts import evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun, flown_inputs
-from qrl.export import betaflight, crazyflie, emit, px4, vectors
+from qrl.export import emit, vectors
 from qrl.export import kernel as reference
 from qrl.export.accuracy import accuracy
+from qrl.export.firmware import betaflight, crazyflie, px4
 from qrl.export.kernel import Ints, Kernel
 from qrl.export.policy import Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, respond
@@ -28,6 +29,8 @@ from qrl.export.report import FlightStats, Measured, gates, report
 from qrl.export.verify import VerificationReport, verify
 from qrl.training import devices
 from qrl_envs.specfile import BadInput
+
+ADAPTERS = (crazyflie, betaflight, px4)
 
 
 def export(args: argparse.Namespace) -> int:
@@ -52,10 +55,9 @@ def export(args: argparse.Namespace) -> int:
         memory = f"{cost.flash:>6,} B {max(cost.stack):>5} B {cost.state:>4} B"
         console.print(f"{cost.core.name:<27} {mean:>12,.0f} {mean_i16:>10,.0f} {memory}")
     duration = clock(time.perf_counter() - start_time)
-    if (run.folder / "export" / crazyflie.FOLDER).is_dir():
-        console.print(f"Crazyflie: {run.folder / 'export' / crazyflie.FOLDER} is an app for its firmware")
-    if (run.folder / "export" / px4.FOLDER).is_dir():
-        console.print(f"PX4: {run.folder / 'export' / px4.FOLDER / px4.FILE} is for its module mc_raptor")
+    for adapter in ADAPTERS:
+        if (found := run.folder / "export" / adapter.FOLDER).is_dir():
+            console.print(f"{adapter.TITLE}: {found} has {adapter.WHAT}")
     console.print(f"done in {duration}: {run.folder / 'export'}/{name}.c, .h, report.md")
     return DONE
 
@@ -91,15 +93,14 @@ def export_run(
         folder = Path(scratch) / "export"
         emitted = emit.files(policy, kernel, vectors.golden(policy, kernel), name)
         _write(folder, emitted)
-        for adapter in (crazyflie, betaflight):
+        for adapter in ADAPTERS:
             _write(folder, adapter.files(policy, emitted, name))
-        _write(folder, px4.files(policy, name))
         (folder / f"{name}.onnx").write_bytes(portable.onnx_model(policy))
         (folder / f"{name}.npz").write_bytes(portable.arrays(policy))
         log("compiling and verifying; flying")
         verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)
-        sections = "".join(adapter.section(policy) for adapter in (crazyflie, betaflight, px4))
+        sections = "".join(adapter.section(policy) for adapter in ADAPTERS)
         _write(folder, {"report.md": report(policy, kernel, measured, name) + sections})
         previous = Path(scratch) / "previous"
         if target.exists():

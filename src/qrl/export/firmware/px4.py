@@ -8,18 +8,25 @@ A tar file of the archive format ustar, as RLtools (Eschmann et al.) writes and 
 import io
 import re
 import tarfile
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrl.export import crazyflie
+from qrl.export.firmware import vehicle
+from qrl.export.firmware.vehicle import Corner
 from qrl.export.policy import Policy, sigmoid
 
-TEMPLATE = Path(__file__).parent / "firmware" / "px4" / "README.md"
-FOLDER, FILE = "px4", "policy.tar"
+TITLE, FOLDER, FILE = "PX4", "px4", "policy.tar"
+WHAT = f"{FILE} for its module mc_raptor"
 RELEASE = "v1.18"
 HIDDEN, UNITS = 16, 16
+# Its actions: of RAPTOR's quadrotor, whose order is the Crazyflie's; mc_raptor renumbers them to PX4's quadrotor X.
+MOTORS = (
+    Corner("front right", 1, -1, -1),
+    Corner("back right", -1, -1, 1),
+    Corner("back left", -1, 1, -1),
+    Corner("front left", 1, 1, 1),
+)
 PERIOD_S = 0.01  # at which mc_raptor steps the memory
 # Its inputs, of qrl's: position, rotation matrix, velocity, body rates; then the previous action, by motor.
 ORDER = (*range(9, 12), *range(9), *range(12, 18))
@@ -33,13 +40,13 @@ Floats = NDArray[np.floating]
 def refusal(policy: Policy) -> str | None:
     """Why mc_raptor cannot fly a policy, in one line; None if it can."""
     memory = policy.memory
-    measured = [port.name for port in policy.observations] == crazyflie.MEASURED
+    measured = [port.name for port in policy.observations] == vehicle.MEASURED
     if not measured or policy.body_frame or not memory or not memory.previous_action or memory.integral:
         return "the inputs are not a vehicle's state in the world's frame and the previous action (as of TASK=raptor)"
     shape = tuple(weight.shape for weight, _ in policy.layers)
     if shape != ((22, HIDDEN), (UNITS, 4)) or memory.units != UNITS or policy.activation != "relu":
         return f"the network is not 22 inputs, {HIDDEN} ReLU, a gated recurrent unit of {UNITS}, 4 outputs"
-    if not crazyflie.any_vehicle(policy):
+    if not vehicle.orders_speeds(policy):
         return "the actions are not rotor speeds"
     if round(policy.control_period_s, 9) != PERIOD_S:
         return f"the control period is {policy.control_period_s * 1e3:g} ms, and mc_raptor's {PERIOD_S * 1e3:g} ms"
@@ -49,7 +56,7 @@ def refusal(policy: Policy) -> str | None:
             return f"its inputs {part.start + 1} to {part.stop} are not clipped at {most:g}, as mc_raptor does"
     if np.isfinite(np.delete(limits, np.r_[9:15])).any():
         return "inputs are clipped that mc_raptor does not clip"
-    order = crazyflie.motor_order(policy)
+    order = vehicle.by_place_and_spin(policy, MOTORS)
     return f"the motors are not those of PX4's quadrotor X: {order}" if isinstance(order, str) else None
 
 
@@ -58,7 +65,7 @@ def tensors(policy: Policy) -> dict[str, NDArray[np.float32]]:
 
     No `refusal`.
     """
-    motors = crazyflie.motor_order(policy)
+    motors = vehicle.by_place_and_spin(policy, MOTORS)
     assert not isinstance(motors, str), motors
     (weight, bias), (last, last_bias) = policy.layers
     unit = policy.unit
@@ -84,7 +91,7 @@ def tensors(policy: Policy) -> dict[str, NDArray[np.float32]]:
 
 def example(policy: Policy) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Inputs [STEPS, FLIGHTS, 22] and outputs [STEPS, FLIGHTS, 4] of mc_raptor's policy, from a reset on."""
-    motors = crazyflie.motor_order(policy)
+    motors = vehicle.by_place_and_spin(policy, MOTORS)
     assert not isinstance(motors, str), motors
     rows = np.resize(policy.calibration[:, :22], (STEPS * FLIGHTS, 22)).astype(np.float64)
     rows[:, 18:] = (rows[:, 18:] - policy.offset) / policy.scale
@@ -140,21 +147,21 @@ def _tensor(path: str, values: NDArray[np.float32]) -> dict[str, bytes]:
     }
 
 
-def files(policy: Policy, name: str) -> dict[str, bytes]:
-    """Path in the export folder -> contents; none with a `refusal`."""
+def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str | bytes]:
+    """Path in the export folder -> contents; none with a `refusal`. The kernel in C is not of use to it."""
+    del kernel
     if refusal(policy):
         return {}
     values = {"name": name, "release": RELEASE, "facts": "\n".join(f"- {fact}" for fact in facts(policy))}
-    readme = re.sub(r"@(\w+)@", lambda match: values[match[1]], TEMPLATE.read_text(encoding="utf-8"))
+    texts = vehicle.filled(FOLDER, values, name)
     run = f"{policy.provenance.run} {policy.provenance.env_steps} {name}"
-    return {f"{FOLDER}/{FILE}": archive(policy, run), f"{FOLDER}/README.md": readme.encode()}
+    return {f"{FOLDER}/{path}": text for path, text in texts.items()} | {f"{FOLDER}/{FILE}": archive(policy, run)}
 
 
 def facts(policy: Policy) -> list[str]:
     """What to know of the policy before flight, a sentence each."""
-    run = policy.provenance
     return [
-        f"{' '.join(run.task.split())}: {' '.join(run.description.split())}.",
+        vehicle.facts(policy)[0],
         "It holds a place or follows `trajectory_setpoint`; it sees no set-point ahead, and lags one that moves.",
         "It has no integral: what it cannot tell from its memory, such as wind, it flies at an offset.",
         "The commands stand for rotor speeds, from 0 to the greatest: motors that are linear in speed, no thrust curve"
@@ -164,10 +171,10 @@ def facts(policy: Policy) -> list[str]:
 
 def section(policy: Policy) -> str:
     """What report.md says of it; nothing of a policy that flies no vehicle."""
-    if any(port.spin is None for port in policy.actions):
+    if not vehicle.flies(policy):
         return ""
     reason = refusal(policy)
     said = (
         f"No {FILE}: {reason}." if reason else f"`{FOLDER}/{FILE}` is for mc_raptor; the README there says how to fly."
     )
-    return f"\n## PX4\n\n{said}\n"
+    return f"\n## {TITLE}\n\n{said}\n"

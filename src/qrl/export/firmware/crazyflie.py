@@ -5,26 +5,24 @@ Facts of the firmware are those of its release 2026.08: `src/platform/interface/
 """
 
 import math
-import re
-from pathlib import Path
 from typing import NamedTuple
 
-from qrl.export.policy import ActionSpec, Policy
+from qrl.export.firmware import vehicle
+from qrl.export.firmware.vehicle import Corner, arm_m, mass_kg
+from qrl.export.policy import WORLD_SIZE, Policy
 
-TEMPLATES = Path(__file__).parent / "firmware" / "crazyflie"
-FOLDER = "crazyflie"
+TITLE, FOLDER = "Crazyflie", "crazyflie"
+WHAT = "an app for its firmware"
 RELEASE = "2026.08"
-# Its motors M1 to M4: the signs of body x and y, and of the reaction torque about body z; NAMES says them.
-MOTORS = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
-NAMES = ("front right", "back right", "back left", "front left")
-MEASURED = [
-    *(f"r{i}{j}" for i in (1, 2, 3) for j in (1, 2, 3)),
-    *(f"{quantity}{axis}" for quantity in "pvw" for axis in "xyz"),
-]
+MOTORS = (
+    Corner("front right (M1)", 1, -1, -1),
+    Corner("back right (M2)", -1, -1, 1),
+    Corner("back left (M3)", -1, 1, -1),
+    Corner("front left (M4)", 1, 1, 1),
+)
 MOST_ARM_RATIO = 1.3  # of a motor's distance from the center, by which a vehicle may differ from the platform
 MOST_HOVER = 0.8  # of a motor's greatest thrust
 MAIN_LOOP_US = 1000
-GRAVITY_M_S2 = 9.81
 
 
 class Platform(NamedTuple):
@@ -74,32 +72,17 @@ PLATFORMS = (
 )
 
 
-def any_vehicle(policy: Policy) -> bool:
-    """Whether it orders rotor speeds, so that it fits each platform."""
-    return all(port.quantity == "rotor speed fraction" for port in policy.actions)
-
-
-def observes_vehicle(policy: Policy) -> bool:
-    """Whether it is given a vehicle's state, and besides that at most previews of a reference."""
-    names, ahead = [port.name for port in policy.observations], policy.observations[18:]
-    return names[:18] == MEASURED and all(port.ahead_s is not None for port in ahead) and len(ahead) % 3 == 0
-
-
 def refusal(policy: Policy) -> str | None:
     """Why a policy cannot fly on a Crazyflie, in one line; None if it can."""
-    if not observes_vehicle(policy):
-        return "the observation is not a vehicle's state, and previews of a reference"
-    if len(policy.actions) != 4:
-        return f"a Crazyflie has four motors, and the policy {len(policy.actions)}"
-    if not (any_vehicle(policy) or all(port.unit == "N" for port in policy.actions)):
-        return "the motors are ordered neither thrusts [N] nor fractions of their greatest speed"
+    if reason := vehicle.misfit(policy):
+        return reason
     period_us = round(policy.control_period_s * 1e6)
     if period_us % MAIN_LOOP_US or period_us < MAIN_LOOP_US:
         return f"a control period of {policy.control_period_s * 1e3:g} ms is no whole number of the main loop's 1 ms"
-    order = motor_order(policy)
+    order = vehicle.by_place_and_spin(policy, MOTORS)
     if isinstance(order, str):
-        return order
-    if any_vehicle(policy):
+        return f"of a Crazyflie's motors, {order}"
+    if vehicle.orders_speeds(policy):
         return None
     hover_N = max(port.safe for port in policy.actions)
     most_N = max(platform.thrust_max_N for platform in PLATFORMS)
@@ -111,41 +94,6 @@ def refusal(policy: Policy) -> str | None:
             f"the motors are {arm_m(policy) * 1e3:.0f} mm from the center, and a Crazyflie's {least} to {greatest} mm"
         )
     return None
-
-
-def motor_order(policy: Policy) -> list[int] | str:
-    """The action of each of M1 to M4, by position and spin; or why there is none."""
-    found = [quadrant(port) for port in policy.actions]
-    order = []
-    for number, (x, y, spin) in enumerate(MOTORS, 1):
-        there = [i for i, place in enumerate(found) if place and place[:2] == (x, y)]
-        if len(there) != 1:
-            return f"a Crazyflie has one motor {NAMES[number - 1]} (M{number}), and the vehicle {len(there)}"
-        if found[there[0]] != (x, y, spin):
-            return (
-                f"a Crazyflie's motor {NAMES[number - 1]} (M{number}) has spin {spin:+d}, and the vehicle's"
-                f" ({policy.actions[there[0]].name}) {-spin:+d}"
-            )
-        order.append(there[0])
-    return order
-
-
-def quadrant(port: ActionSpec) -> tuple[int, int, int | None] | None:
-    """Signs of a motor's x and y, and its spin; None if it has no place off the axes."""
-    if port.position_m is None or 0.0 in port.position_m[:2]:
-        return None
-    x, y = (int(math.copysign(1, value)) for value in port.position_m[:2])
-    return x, y, port.spin
-
-
-def arm_m(policy: Policy) -> float:
-    """Mean distance of the motors from the body's z axis."""
-    return sum(math.hypot(*(port.position_m or (0.0, 0.0))[:2]) for port in policy.actions) / len(policy.actions)
-
-
-def mass_kg(policy: Policy) -> float:
-    """That the hover thrusts lift."""
-    return sum(port.safe for port in policy.actions) / GRAVITY_M_S2
 
 
 def _fitting(policy: Policy) -> list[Platform]:
@@ -167,37 +115,31 @@ def _fitting(policy: Policy) -> list[Platform]:
 
 def platform(policy: Policy) -> Platform | None:
     """The build that a policy is for; None: any of `PLATFORMS`."""
-    return None if any_vehicle(policy) else _fitting(policy)[0]
+    return None if vehicle.orders_speeds(policy) else _fitting(policy)[0]
 
 
 def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
     """The app of a policy: path in the export folder -> text; none with a `refusal`. `kernel`: NAME.c and NAME.h."""
     if refusal(policy):
         return {}
-    values = _values(policy, name)
-    templates = {path.relative_to(TEMPLATES).as_posix(): path for path in TEMPLATES.rglob("*") if path.is_file()}
-    app = {
-        f"{FOLDER}/{path.replace('NAME', name)}": re.sub(
-            r"@(\w+)@", lambda match: values[match[1]], file.read_text(encoding="utf-8")
-        )
-        for path, file in templates.items()
-    }
-    return app | {f"{FOLDER}/src/{file}": kernel[file] for file in (f"{name}.c", f"{name}.h")}
+    texts = vehicle.filled(FOLDER, _values(policy, name), name)
+    texts |= {f"src/{file}": kernel[file] for file in (f"{name}.c", f"{name}.h")}
+    return {f"{FOLDER}/{path}": text for path, text in texts.items()}
 
 
 def section(policy: Policy) -> str:
     """What report.md says of it; nothing of a policy that flies no vehicle."""
-    if any(port.spin is None for port in policy.actions):
+    if not vehicle.flies(policy):
         return ""
     reason = refusal(policy)
     lines = [f"No app: {reason}."] if reason else [f"`{FOLDER}/` is an app; its README says how to build it.", ""]
     lines += [] if reason else [f"- {fact}" for fact in facts(policy)]
-    return "\n## Crazyflie\n\n" + "\n".join(lines) + "\n"
+    return f"\n## {TITLE}\n\n" + "\n".join(lines) + "\n"
 
 
 def _values(policy: Policy, name: str) -> dict[str, str]:
     """Values of the templates' @placeholders@."""
-    order = motor_order(policy)
+    order = vehicle.by_place_and_spin(policy, MOTORS)
     assert not isinstance(order, str), order
     build = platform(policy)
     return {
@@ -205,7 +147,7 @@ def _values(policy: Policy, name: str) -> dict[str, str]:
         "NAME": name.upper(),
         "period_ms": f"{policy.control_period_s * 1e3:.0f}",
         **{f"m{number}": policy.actions[i].name.upper() for number, i in enumerate(order, 1)},
-        "preview": _preview(policy, name),
+        "preview": vehicle.preview(policy, name, "setpoint->acceleration.{axis}", "setpoint->jerk.{axis}"),
         "fraction": _fraction(policy),
         "platform_guard": _guard(policy, build),
         "platform_config": f"\n{build.config}" if build and build.config else "",
@@ -217,30 +159,9 @@ def _values(policy: Policy, name: str) -> dict[str, str]:
     }
 
 
-def _preview(policy: Policy, name: str) -> str:
-    """C that fills in the previews."""
-    ports = policy.observations[18::3]
-    if not ports:
-        return ""
-    times = ", ".join(f"{port.ahead_s:g}f" if "." in f"{port.ahead_s:g}" else f"{port.ahead_s:g}.0f" for port in ports)
-    return PREVIEW.format(NAME=name.upper(), times=times, count=len(ports))
-
-
-PREVIEW = """
-
-    /* A set-point does not tell what comes: the reference is taken to go on with its acceleration and jerk. */
-    static const float ahead_s[] = {{{times}}};
-    for (int k = 0; k < {count}; ++k) {{
-        const float t = ahead_s[k], half = 0.5f * t * t;
-        turned(heading, setpoint->acceleration.x * t + setpoint->jerk.x * half,
-               setpoint->acceleration.y * t + setpoint->jerk.y * half,
-               setpoint->acceleration.z * t + setpoint->jerk.z * half, &obs[{NAME}_OBS_D1X + 3 * k]);
-    }}"""
-
-
 def _fraction(policy: Policy) -> str:
     """C that turns an action into a fraction of THRUST_MAX."""
-    if not any_vehicle(policy):
+    if not vehicle.orders_speeds(policy):
         return "    const float share = action / THRUST_MAX; /* newtons */"
     brushed, *_, brushless = PLATFORMS
     return FRACTION.format(brushless=f"{brushless.thrust_curve:g}f", brushed=f"{brushed.thrust_curve:g}f")
@@ -270,12 +191,7 @@ def _guard(policy: Policy, build: Platform | None) -> str:
 
 def facts(policy: Policy) -> list[str]:
     """What to know of the policy before flight, a sentence each."""
-    run, about = policy.provenance, policy.observations[9].frame
-    found = [
-        f"{' '.join(run.task.split())}: {' '.join(run.description.split())}.",
-        f"The set-point's position is {about.removeprefix('world: position from ')}.",
-        f"The policy runs every {policy.control_period_s * 1e3:.0f} ms; the motors hold between.",
-    ]
+    found = vehicle.facts(policy)
     build = platform(policy)
     if build is None:
         found.append("It orders rotor speeds and was trained on many vehicles: it flies each Crazyflie.")
@@ -292,7 +208,7 @@ def facts(policy: Policy) -> list[str]:
             )
         if policy.memory is None or not (policy.memory.integral or policy.memory.units):
             found.append("It has no integral and no recurrent memory: a vehicle of another mass flies at an offset.")
-    if len(policy.observations) > 18:
+    if len(policy.observations) > WORLD_SIZE:
         most_s = max(port.ahead_s or 0.0 for port in policy.observations)
         found.append(
             f"It looks up to {most_s:g} s ahead, of which set-points say nothing: the reference is taken to go on with"
