@@ -171,21 +171,3 @@ def test_a_seed_of_several_is_repeated_as_it_was_trained() -> None:
     for seeds, there, each in ((2, 4, 2), (4, 4, 1), (3, 2, 2), (1, 2, 2), (2, 1, 1), (2, 0, 0)):
         both = run().model_copy(update={"seeds": seeds, "devices": devices[:there]})
         assert both.member(0).devices == devices[:each]
-
-
-@pytest.mark.parametrize(
-    ("environment", "cores", "threads"),
-    [
-        ({}, 1, "2"),
-        ({}, 4, None),
-        ({"PJRT_NPROC": "1"}, 4, "2"),
-        ({"NPROC": "1"}, 4, "2"),
-        ({"PJRT_NPROC": "3"}, 1, "3"),
-    ],
-)
-def test_a_program_that_calls_python_has_two_threads(
-    environment: dict, cores: int, threads: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(processes, "cores", lambda: cores)
-    processes.configure_callbacks(environment)
-    assert environment.get("PJRT_NPROC") == threads

@@ -41,39 +41,76 @@ def fly_with_memory(
     max_episode_steps: int,
     reset: Callable[[Env, chex.PRNGKey], State] = lambda env, keys: jax.vmap(env.reset)(keys),
 ) -> Flights:
-    """Fly one start for each key under policy(memory, observation) -> next memory, action, which is clipped to [−1, 1].
+    """Fly one start for each key under policy(memory, observation) -> next memory, action, as a `FlightPlan` says.
 
-    `memory`, for all starts, is that of the first step.
-    An environment with an `evaluation` is flown and measured as that says, another for one episode of
-    `max_episode_steps`. `reset` draws the starts. What is recorded and measured is `info["true_obs"]`, if present,
-    while the policy sees the observation. A flight that ends early has no more observations: its NaNs make it a
-    failure. Out of bounds its last reward goes on: where rewards are below 0, its return would else be the better
-    for it.
+    `memory`, for all starts, is that of the first step. `reset` draws the starts.
     """
-    plan = adapt(env).evaluation()
-    measure = plan.measure if plan else None
-    env, steps, return_steps = (plan.env, plan.steps, plan.return_steps) if plan else (env, *[max_episode_steps] * 2)
+    plan = FlightPlan.of(env, max_episode_steps)
 
-    def step(carry: tuple, t: chex.Array) -> tuple[tuple, tuple[chex.Array, chex.Array]]:
-        state, total, memory = carry
-        memory, action = policy(memory, state.obs)
-        action = jnp.clip(action, -1.0, 1.0)
-        after = jax.vmap(env.step)(state, action)
+    def step(carry: tuple[Progress, Any], _: None) -> tuple[tuple[Progress, Any], tuple[chex.Array, chex.Array]]:
+        now, memory = carry
+        memory, action = policy(memory, now.state.obs)
+        after, action = plan.step(now, action)
+        return (after, memory), (observed(now.state), action)
+
+    (last, _), (observations, actions) = jax.lax.scan(
+        step, (plan.start(reset(plan.env, keys)), memory), length=plan.steps
+    )
+    return plan.flights(last, observations, actions)
+
+
+class Progress(NamedTuple):
+    """Flights between two steps; leading axis: starts."""
+
+    state: State
+    returns: chex.Array  # [n]
+    steps: chex.Array  # [] done
+
+
+class FlightPlan(NamedTuple):
+    """How an environment is flown and measured: as its `evaluation` says, another for one episode.
+
+    What is recorded and measured is `info["true_obs"]`, if present, while the policy sees the observation. A flight
+    that ends early has no more observations: its NaNs make it a failure. Out of bounds its last reward goes on: where
+    rewards are below 0, its return would else be the better for it.
+    """
+
+    env: Env
+    steps: int
+    return_steps: int
+    measure: Callable[[chex.Array], dict[str, chex.Array]] | None
+
+    @classmethod
+    def of(cls, env: Env, max_episode_steps: int) -> "FlightPlan":
+        """`max_episode_steps`: of an environment without an `evaluation`."""
+        plan = adapt(env).evaluation()
+        if plan is None:
+            return cls(env, max_episode_steps, max_episode_steps, None)
+        return cls(plan.env, plan.steps, plan.return_steps, plan.measure)
+
+    def start(self, state: State) -> Progress:
+        """From states of a reset."""
+        return Progress(state, jnp.zeros(state.reward.shape), jnp.zeros((), int))
+
+    def step(self, now: Progress, action: chex.Array) -> tuple[Progress, chex.Array]:
+        """The flights a step later, and the action [n, A] that they were given, clipped to [−1, 1]."""
+        state, action = now.state, jnp.clip(action, -1.0, 1.0)
+        after = jax.vmap(self.env.step)(state, action)
         over = state.done.astype(bool)
         held = jax.tree.map(lambda new, old: jnp.where(over.reshape(-1, *[1] * (new.ndim - 1)), old, new), after, state)
         terminated = over & ~info_flag(state, "out_of_bounds")
-        total = total + jnp.where(terminated | (t >= return_steps), 0.0, held.reward)
-        return (held, total, memory), (_observed(state), action)
+        reward = jnp.where(terminated | (now.steps >= self.return_steps), 0.0, held.reward)
+        return Progress(held, now.returns + reward, now.steps + 1), action
 
-    state = reset(env, keys)
-    first = state, jnp.zeros(keys.shape[0]), memory
-    (state, returns, _), (observations, actions) = jax.lax.scan(step, first, jnp.arange(steps))
-    observations = jnp.concatenate([observations, _observed(state)[None]]).swapaxes(0, 1)
-    measures = jax.vmap(measure)(observations) if measure else {}
-    return Flights(returns, ~state.done.astype(bool), measures, observations, actions.swapaxes(0, 1))
+    def flights(self, last: Progress, observations: chex.Array, actions: chex.Array) -> Flights:
+        """Of what was recorded before each step, [steps, n, F] and [steps, n, A]."""
+        observations = jnp.concatenate([observations, observed(last.state)[None]]).swapaxes(0, 1)
+        measures = jax.vmap(self.measure)(observations) if self.measure else {}
+        return Flights(last.returns, ~last.state.done.astype(bool), measures, observations, actions.swapaxes(0, 1))
 
 
-def _observed(state: State) -> chex.Array:
+def observed(state: State) -> chex.Array:
+    """What is recorded of a state; NaN where the flight has ended."""
     return jnp.where(state.done.astype(bool)[:, None], jnp.nan, state.info.get("true_obs", state.obs))
 
 

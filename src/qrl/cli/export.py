@@ -27,7 +27,6 @@ from qrl.export.policy import Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, respond
 from qrl.export.report import FlightStats, Measured, gates, report
 from qrl.export.verify import VerificationReport, verify
-from qrl.training import devices
 from qrl_envs.specfile import BadInput
 
 ADAPTERS = (crazyflie, betaflight, px4)
@@ -36,7 +35,6 @@ ADAPTERS = (crazyflie, betaflight, px4)
 def export(args: argparse.Namespace) -> int:
     """Write RUN/export; print verification, gates and costs."""
     start_time = time.perf_counter()
-    devices.configure_callbacks()
     run = TrainedRun.load(args.run)
     name = kernel_name(run, args.name)
     measured = export_run(run, args.starts, args.vectors, console.print, name)
@@ -153,9 +151,9 @@ def _measured(
 def fly_kernel(run: TrainedRun, policy: Policy, kernel: Kernel, starts: chex.PRNGKey) -> Flights:
     """Flights of the integer reference, whose bits are the kernel's, in the environment of `run`."""
 
-    def step(state: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
+    def step(state: Ints, observation: NDArray[np.float32]) -> tuple[Ints, NDArray[np.float32]]:
         """It has the measured observation only, and keeps its own memory."""
-        after, _, action = reference.step(kernel, state.astype(np.int64), observation[:, : len(policy.observations)])
+        after, _, action = reference.step(kernel, state, observation[:, : len(policy.observations)])
         return after, action
 
     return run.fly_host_policy(step, reference.initial_state(kernel, len(starts)), starts)

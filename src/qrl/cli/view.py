@@ -14,7 +14,6 @@ from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import STARTS, evaluation_starts
 from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import files, record
-from qrl.training import devices
 from qrl_envs import viewer
 from qrl_envs.specfile import BadInput
 from qrl_envs.viewer import Recording
@@ -27,8 +26,6 @@ LANES = 8  # the number of starts is a multiple, so that few numbers of starts a
 
 def view(args: argparse.Namespace) -> int:
     """Fly a few starts of `qrl evaluate` with every seed of a run; write view.html to each folder."""
-    if args.kernel:
-        devices.configure_callbacks()
     config = tasks.load_run_config(args.run)
     config = config.model_copy(update={"task": tasks.following(config.task, args.reference, args.vehicle)})
     if not config.task.spec:

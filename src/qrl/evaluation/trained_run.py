@@ -2,26 +2,23 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import chex
-import jax
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
 from qrl import tasks
-from qrl.algorithm import flights
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.flights import Flights
 from qrl.algorithm.learner import MAX_NORMALIZED, LearnerState
 from qrl.algorithm.running_statistics import std
-from qrl.algorithm.types import Env, State
+from qrl.algorithm.types import Env
 from qrl.evaluation import calibration
 from qrl.evaluation.flight_programs import FlightPrograms
+from qrl.evaluation.host_flights import HostFlights
 from qrl.evaluation.starts import calibration_starts
 from qrl.export.policy import (
     ActionSpec,
@@ -45,8 +42,8 @@ from qrl_envs.task import QuadrotorTask, Task
 from qrl_envs.vehicle import shipped_vehicles
 
 POSITION = 9  # index of the position in an observation
-HostStep = Callable[[NDArray[np.integer], NDArray[np.float32]], tuple[NDArray[Any], NDArray[np.floating]]]
-"""Memory [n, S] and observation [n, I] of n flights -> next memory, and action [n, A] in SI units."""
+HostStep = Callable[[Any, NDArray[np.float32]], tuple[Any, NDArray[np.floating]]]
+"""Memory and observation [n, I] of n flights -> next memory, and action [n, A] in SI units."""
 
 
 class TrainedRun:
@@ -63,7 +60,7 @@ class TrainedRun:
         self.task = tasks.spec(config.task) if config.task.spec else None  # None: not one of qrl_envs
         self._programs = programs
         self._learner = learner
-        self._fly_host = jax.jit(self._host_flights, static_argnums=0)
+        self._on_host: dict[bool, HostFlights] = {}  # by whether they calibrate
 
     @classmethod
     def load(cls, folder: Path, checkpoint: int = -1, programs: FlightPrograms | None = None) -> "TrainedRun":
@@ -101,52 +98,25 @@ class TrainedRun:
         return self._programs.fly(self._learner, env or self.env, starts)
 
     def fly_host_policy(
-        self,
-        step: HostStep,
-        memory: NDArray[np.integer],
-        starts: chex.PRNGKey,
-        from_envelope: float = 0.0,
-        calibrating: bool = False,
+        self, step: HostStep, memory: Any, starts: chex.PRNGKey, from_envelope: float = 0.0, calibrating: bool = False
     ) -> Flights:
         """Flights of a NumPy policy in the run's environment; a fraction `from_envelope` starts in the envelope. Where
         the task tracks a reference, `calibrating` follows those of training.
 
-        `memory` [starts, S] is that of the first step. Compiled once for each size of it; the policy runs on the host
-        (`jax.pure_callback`).
+        `memory`, of all starts, is that of the first step. Compiled once for each number of starts.
         """
         _, actions = self._specs()
         offset, scale = (np.array([getattr(action, name) for action in actions]) for name in ("offset", "scale"))
 
-        def normalized(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[Any, Any]:
-            memory, action = step(np.asarray(memory), np.asarray(observation))
-            return memory.astype(np.int32), ((action - offset) / scale).astype(np.float32)
+        def normalized(memory: Any, observation: NDArray[np.float32]) -> tuple[Any, NDArray[np.floating]]:
+            memory, action = step(memory, observation)
+            return memory, (action - offset) / scale
 
-        self._host_policy = normalized
-        in_envelope = jnp.arange(len(starts)) >= (1.0 - from_envelope) * len(starts)
-        return jax.tree.map(np.asarray, self._fly_host(calibrating, memory.astype(np.int32), starts, in_envelope))
-
-    def _host_flights(
-        self, calibrating: bool, memory: chex.Array, starts: chex.PRNGKey, in_envelope: chex.Array
-    ) -> Flights:
-        env = self.env.calibrating() if calibrating and isinstance(self.env, RealQuadrotorEnv) else self.env
-
-        def policy(memory: chex.Array, observation: chex.Array) -> tuple[chex.Array, chex.Array]:
-            action = jax.ShapeDtypeStruct((*observation.shape[:-1], self.env.action_size), jnp.float32)
-            shapes = jax.ShapeDtypeStruct(memory.shape, jnp.int32), action
-            return jax.pure_callback(lambda m, o: self._host_policy(m, o), shapes, memory, observation)
-
-        def reset(env: Env, in_envelope: chex.Array, key: chex.PRNGKey) -> State:
-            states = adapt(env).reset_calibration(key), env.reset(key)
-            return jax.tree.map(partial(jnp.where, in_envelope), *states)
-
-        return flights.fly_with_memory(
-            env,
-            policy,
-            memory,
-            starts,
-            self.max_episode_steps,
-            lambda env, keys: jax.vmap(partial(reset, env))(in_envelope, keys),
-        )
+        if calibrating not in self._on_host:
+            own = calibrating and isinstance(self.env, RealQuadrotorEnv)
+            env = self.env.calibrating() if own else self.env
+            self._on_host[calibrating] = HostFlights(env, self.max_episode_steps)
+        return self._on_host[calibrating].fly(normalized, memory, starts, from_envelope)
 
     def initial_memory(self, *lanes: int) -> Any:
         """The policy's memory at the start of a flight; [*lanes, H], or () of a feed-forward policy."""
@@ -161,18 +131,19 @@ class TrainedRun:
 
         `memory`: as `float_policy` takes it.
         """
-        policy = self.float_policy(memory)
+        policy, flown = self.float_policy(memory), []
 
-        def step(memory: NDArray[np.integer], observation: NDArray[np.float32]) -> tuple[NDArray[np.integer], Any]:
-            # The environment keeps the rest of the memory; the numbers of a recurrent unit travel as their bits.
-            inputs = np.concatenate([inputs_in_si(policy, observation), memory.view(np.float32)], axis=-1)
-            h, action = policy.respond(inputs)
-            return np.ascontiguousarray(h, np.float32).view(np.int32), action
+        def step(h: NDArray[np.floating], observation: NDArray[np.float32]) -> tuple[Any, NDArray[np.floating]]:
+            inputs = np.concatenate([inputs_in_si(policy, observation), h], axis=-1)  # the environment keeps the rest
+            flown.append(inputs)
+            return policy.respond(inputs)
 
         starts = calibration_starts(calibration.STARTS)
-        first = np.zeros((len(starts), policy.memory.units if policy.memory else 0), np.int32)
-        flown = self.fly_host_policy(step, first, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
-        return replace(policy, calibration=calibration.select(flown_inputs(policy, flown)))
+        h = np.zeros((len(starts), policy.memory.units if policy.memory else 0))
+        flights = self.fly_host_policy(step, h, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
+        inputs = np.stack(flown, axis=1, dtype=np.float32)
+        ended = np.isnan(flights.observations[:, :-1]).any(axis=-1)
+        return replace(policy, calibration=calibration.select(np.where(ended[..., None], np.nan, inputs)))
 
     def float_policy(self, memory: Memory | None = None) -> Policy:
         """The policy as a value in SI units, without observations to calibrate on.

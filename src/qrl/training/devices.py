@@ -42,14 +42,6 @@ def configure_cpu(run: RunConfig, before: Sequence[str], environment: MutableMap
         environment["PJRT_NPROC"] = "1"  # the threads of so small a product would mostly wait
 
 
-def configure_callbacks(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Give XLA two threads at least: with one, a program that calls Python waits for ever for what it is to hand over,
-    where that is 100 KB or more. To be called before JAX initializes its devices.
-    """
-    if threads(environment) == "1":
-        environment["PJRT_NPROC"] = "2"
-
-
 def threads(environment: Mapping[str, str] = os.environ) -> str:
     """XLA's number of threads in a process of this one's environment."""
     return next((environment[name] for name in THREADS if name in environment), str(cores()))
