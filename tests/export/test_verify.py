@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import policies
-from cross_targets import BODIES, EITHER, M0, M4F, M55, RV32IMC, need
+from cross_targets import BODIES, EITHER, M0, M4F, M55, RV32EC, RV32IMC, need
 from policies import FLAT, HOVER, ODD, PENDULUM
 from qrl.export import targets, vectors
 from qrl.export.kernel import Dense, Kernel
@@ -140,7 +140,8 @@ Cases = dict[tuple[str, str], tuple[Outputs, Counts, targets.Sizes]]
 
 
 # Policies of hover, and how many vectors: one on all cores, the other on one for each body.
-ON_CORES = {("relu", core): MANY if core in BODIES else SOME for core in CORES} | {("tanh", c): SOME for c in BODIES}
+ON_CORES = {("relu", core): MANY if core in BODIES else SOME // core.share for core in CORES}
+ON_CORES |= {("tanh", core): SOME for core in BODIES}
 EACH_CASE = pytest.mark.parametrize(
     ("activation", "core"),
     ON_CORES,
@@ -174,7 +175,7 @@ def test_every_core_gives_the_references_bits(activation: str, core: Core, cases
 
 
 BARS = {"M0": (26_500, 25_500), "M3": (18_500, 18_000), "M4F": (10_600, 10_200), "M7": (10_600, 10_200)}
-BARS |= {"M33": BARS["M4F"], "M55": (4_000, 3_700), "RV32IMC": (25_000, 24_000)}
+BARS |= {"M33": BARS["M4F"], "M55": (4_000, 3_700), "RV32IMC": (25_000, 24_000), "RV32EC": (420_000, 420_000)}
 
 
 @EACH_CASE
@@ -186,7 +187,7 @@ def test_it_costs_no_more_than_the_bars(activation: str, core: Core, cases: Case
     least = 5_504 / (8 if core is M55 else 2)  # multiply-adds an instruction at best
     assert least < counts.i16[flights].mean() <= step_i16
     assert least < counts.f32[flights].mean() <= step
-    assert size.text + size.data <= (9_472 if core is RV32IMC else 8_960)
+    assert size.text + size.data <= (9_472 if core in (RV32IMC, RV32EC) else 8_960)
     assert (size.data, size.bss) == (0, 0)
     assert 0 < counts.stack_f32 <= 512
     assert 0 < counts.stack_i16 <= 512
@@ -194,11 +195,13 @@ def test_it_costs_no_more_than_the_bars(activation: str, core: Core, cases: Case
 
 @EACH_CASE
 def test_the_time_it_takes_hardly_varies(activation: str, core: Core, cases: Cases) -> None:
-    """Fixed trip counts: whatever is observed, within a twentieth of the mean; what is not finite ends early."""
+    """Fixed trip counts: whatever is observed, within a twentieth of the mean; what is not finite ends early. A core
+    without a multiplier takes longer for larger numbers.
+    """
     _, counts, _ = cases[activation, core.name]
     wanted = expected(HOVER, activation, ON_CORES[activation, core])
     for each in (counts.i16, counts.f32[wanted.outputs.status < 2]):
-        assert np.ptp(each) < 0.1 * each.mean()
+        assert np.ptp(each) < (1.0 if core is RV32EC else 0.1) * each.mean()
     assert counts.f32[wanted.outputs.status == 2].max() < counts.f32.mean()
 
 

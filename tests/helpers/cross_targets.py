@@ -6,7 +6,7 @@ import pytest
 
 from qrl.export.targets import CORES
 
-M0, M3, M4F, M7, M33, M55, RV32IMC = CORES
+M0, M3, M4F, M7, M33, M55, RV32IMC, RV32EC = CORES
 BODIES = M0, M4F, M55, RV32IMC  # one for each body of the template: Armv6-M, Arm DSP, Helium, C99
 # For the fixture `core`: None is the host.
 EACH = pytest.mark.parametrize("core", CORES, ids=[core.name for core in CORES], indirect=True)

@@ -66,6 +66,7 @@ class Core(NamedTuple):
     ram_bytes: int
     clock_MHz: int
     cycles_per_instruction: float
+    share: int = 1  # of the inputs of a verification, it runs one in so many
 
 
 _KIB, _MIB = 1 << 10, 1 << 20
@@ -80,7 +81,10 @@ _M4, _M7, _M33 = (
     (f"-mcpu=cortex-{name}", f"-mfpu={fpu}-sp-d16", *_HARD)
     for name, fpu in (("m4", "fpv4"), ("m7", "fpv5"), ("m33", "fpv5"))
 )
-_RV32IMC = ("-march=rv32imc", "-mabi=ilp32", "-specs=picolibc.specs")
+_RV32IMC, _RV32EC = (
+    (f"-march={march}", f"-mabi={abi}", "-specs=picolibc.specs")
+    for march, abi in (("rv32imc", "ilp32"), ("rv32ec", "ilp32e"))
+)
 _LOW, _SECURE, _HIGH = (0, 0x2000_0000), (0x1000_0000, 0x3800_0000), (0x8000_0000, 0x8040_0000)
 _BIG = (4 * _MIB, 4 * _MIB)
 CORES = (
@@ -91,6 +95,7 @@ CORES = (
     Core("M33", CORTEX_M, "mps2-an505", _M33, 50.0, _SECURE, 4 * _MIB, 2 * _MIB, 150, 1.3),
     Core("M55", CORTEX_M, "mps3-an547", ("-mcpu=cortex-m55", *_HARD), 31.25, _LOW, 512 * _KIB, 512 * _KIB, 160, 1.2),
     Core("RV32IMC", RISC_V, "virt", _RV32IMC, 1.0, _HIGH, *_BIG, 160, 1.3),
+    Core("RV32EC", RISC_V, "virt", _RV32EC, 1.0, _HIGH, *_BIG, 48, 1.5, share=10),  # it multiplies in software
 )
 
 

@@ -16,6 +16,7 @@ from qrl.export.vectors import Outputs, Vectors
 
 SEQUENCES = 2
 HOST_STEPS, CORE_STEPS = 6_000, 600  # of each sequence
+LEAST = 300  # vectors of each entry point, so that there are some of each kind
 
 
 class Cost(NamedTuple):
@@ -29,6 +30,7 @@ class Cost(NamedTuple):
     static_ram: int  # bytes
     stack: tuple[int, int, int]  # bytes, of each entry point and the self-test, libraries included
     library: int  # bytes of compiler library that the object needs
+    inputs: int  # that it was verified on, of each entry point
 
 
 class VerificationReport(NamedTuple):
@@ -47,10 +49,13 @@ def verify(policy: Policy, kernel: Kernel, source: Path, n: int) -> Verification
 
     Raises VerificationFailed at the first bit that differs from the reference.
     """
-    on_host, on_core = ([vectors.draw(policy, kernel, n)] for _ in range(2))
-    if policy.memory:
-        on_host.append(vectors.draw_sequences(policy, kernel, SEQUENCES, HOST_STEPS))
-        on_core.append(vectors.draw_sequences(policy, kernel, SEQUENCES, CORE_STEPS))
+
+    def drawn(n: int, steps: int) -> list[Vectors]:
+        long = [vectors.draw_sequences(policy, kernel, SEQUENCES, steps)] if policy.memory else []
+        return [vectors.draw(policy, kernel, n), *long]
+
+    on_host = drawn(n, HOST_STEPS)
+    on_core = {share: drawn(max(n // share, LEAST), CORE_STEPS // share) for share in {core.share for core in CORES}}
     passed, skipped, costs = [], [], []
     with TemporaryDirectory() as work, ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs: list[tuple[str, Future[Cost | None]]] = []
@@ -65,10 +70,10 @@ def verify(policy: Policy, kernel: Kernel, source: Path, n: int) -> Verification
                 continue
             for core in CORES:
                 if core.toolchain == toolchain:
-                    jobs.append((core.name, pool.submit(_on_core, core, source, Path(work), on_core)))
+                    jobs.append((core.name, pool.submit(_on_core, core, source, Path(work), on_core[core.share])))
         for name, job in jobs:
             cost = job.result()
-            passed.append(name)
+            passed.append(f"{name} ({cost.inputs:,} of them)" if cost and cost.inputs < n else name)
             costs += [cost] if cost else []
     return VerificationReport(passed, skipped, costs, n, (HOST_STEPS, CORE_STEPS) if policy.memory else None)
 
@@ -95,6 +100,7 @@ def _on_core(core: Core, source: Path, work: Path, expected: list[Vectors]) -> C
         static_ram=size.data + size.bss,
         stack=(counts.stack_f32, counts.stack_i16, counts.stack_selftest),
         library=size.library,
+        inputs=len(first.obs),
     )
 
 
