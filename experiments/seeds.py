@@ -23,7 +23,8 @@ from experiments.figures import runs
 from experiments.seeds_report import FINISHED, FLIES, UNFINISHED, Row, name, report
 from qrl import tasks
 from qrl.algorithm.flights import summarize
-from qrl.cli.main import configure_jax, count, whole_number
+from qrl.cli.arguments import count, whole_number
+from qrl.cli.main import configure_jax
 from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT
 from qrl.evaluation.flight_programs import FlightPrograms
 from qrl.evaluation.starts import STARTS, evaluation_starts

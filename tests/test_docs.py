@@ -9,7 +9,7 @@ import pytest
 
 from cli_helpers import TINY_VALUES
 from qrl import api
-from qrl.cli.main import build_parser
+from qrl.cli.arguments import build_parser
 from qrl.config import Config, preset_names
 
 ROOT = Path(__file__).resolve().parents[1]

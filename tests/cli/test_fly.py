@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from qrl.cli import fly as command
-from qrl.cli.main import build_parser
+from qrl.cli.arguments import build_parser
 from qrl.evaluation.trained_run import TrainedRun
 from qrl.runs import shipped
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from qrl import tasks
-from qrl.cli.main import _note_former_names, _parse, limit_size
+from qrl.cli.arguments import parse
+from qrl.cli.main import _note_former_names, limit_size
 from qrl.config import FORMER_NAMES, Config
 from qrl.request import config_file
 from qrl_envs.specfile import BadInput
@@ -18,7 +19,7 @@ def test_a_former_flag_sets_what_it_is_called_now(former: str, name: str, capsys
     """And says so; the flag of today says nothing."""
     assert name in Config.model_fields
     flags = [f"--{each.replace('_', '-')}" for each in (former, name)]
-    given = [vars(_parse(["train", "hover", flag, "7"]))[f"learner.{name}"] for flag in flags]
+    given = [vars(parse(["train", "hover", flag, "7"]))[f"learner.{name}"] for flag in flags]
     assert given == ["7", "7"]
     assert capsys.readouterr().out == f"note: {flags[0]} is now {flags[1]}\n"
 
@@ -48,7 +49,7 @@ def test_a_file_with_a_former_name_is_noted(tmp_path: Path, capsys: pytest.Captu
 
 def test_help_gives_type_and_default_of_each_hyperparameter(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        _parse(["train", "--help"])
+        parse(["train", "--help"])
     text = " ".join(capsys.readouterr().out.split())
     assert "--num-envs INT environments stepped in parallel (lanes) (default 64)" in text
     assert "--form ratio|difference" in text

@@ -8,7 +8,8 @@ import pytest
 
 from qrl import tasks
 from qrl.cli import train
-from qrl.cli.main import build_parser, main
+from qrl.cli.arguments import build_parser
+from qrl.cli.main import main
 from qrl.runs import record
 from qrl.training import driver, loop
 from qrl.training.driver import Clock
