@@ -264,7 +264,7 @@ def test_both_packages_are_read(house: House) -> None:
 
 def test_the_package_and_its_help_load_no_jax() -> None:
     """JAX takes most of a command's first seconds."""
-    program = "import sys, qrl_envs, qrl.cli.main, qrl.cli.arguments as cli; cli.build_parser(); print('jax' in sys.modules)"
+    program = "import sys, qrl.cli.main, qrl.cli.arguments as cli; cli.build_parser(); print('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, text=True).stdout == "False\n"
 
 

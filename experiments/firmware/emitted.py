@@ -11,7 +11,8 @@ from qrl.export.policy import Policy
 class Adapter(Protocol):
     """A module of qrl.export.firmware whose files are text."""
 
-    FOLDER: str
+    @property
+    def FOLDER(self) -> str: ...
 
     def files(self, policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]: ...
 

@@ -113,8 +113,7 @@ class TrainedRun:
             return memory, (action - offset) / scale
 
         if calibrating not in self._on_host:
-            own = calibrating and isinstance(self.env, RealQuadrotorEnv)
-            env = self.env.calibrating() if own else self.env
+            env = self.env.calibrating() if calibrating and isinstance(self.env, RealQuadrotorEnv) else self.env
             self._on_host[calibrating] = HostFlights(env, self.max_episode_steps)
         return self._on_host[calibrating].fly(normalized, memory, starts, from_envelope)
 
@@ -142,8 +141,8 @@ class TrainedRun:
         h = np.zeros((len(starts), policy.memory.units if policy.memory else 0))
         flights = self.fly_host_policy(step, h, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
         inputs = np.stack(flown, axis=1, dtype=np.float32)
-        ended = np.isnan(flights.observations[:, :-1]).any(axis=-1)
-        return replace(policy, calibration=calibration.select(np.where(ended[..., None], np.nan, inputs)))
+        ended = np.isnan(np.asarray(flights.observations)[:, :-1]).any(axis=-1, keepdims=True)
+        return replace(policy, calibration=calibration.select(np.where(ended, np.nan, inputs)))
 
     def float_policy(self, memory: Memory | None = None) -> Policy:
         """The policy as a value in SI units, without observations to calibrate on.

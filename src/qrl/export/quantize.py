@@ -18,12 +18,10 @@ from numpy.typing import NDArray
 
 from qrl.export import kernel as integers
 from qrl.export.accuracy import accuracy
+from qrl.export.fit import Floats, UnsupportedNetwork, fitted_layer, sensitivity
 from qrl.export.kernel import INT16, TANH_RANGE, Dense, Ints, Kernel, accumulator_bound, hidden
 from qrl.export.policy import ACTIVATIONS, BodyFrame, GatedUnit, Layer, Policy
 
-Floats = NDArray[np.float64]
-
-INT8 = 127
 RANGE_MARGIN = 1.05  # range of an observation over its maximum in calibration
 ACTIVATION_MARGIN = 1.2
 MIN_LEVELS = 511  # steps within the range of an input or activation, however small its weights
@@ -32,14 +30,7 @@ MIN_RANGE = 0.05  # of an activation, relative to its layer's largest: a unit in
 RIDGES = (0.01, 0.03, 0.3)  # pull of the fitted weights towards the float ones, in the order tried
 GOOD_ENOUGH = 0.03  # maximum action error on the calibration, as a fraction of full scale, that ends the trials
 INTEGRAL_BITS = 15  # by which the integral's unit is finer, at most, than the finest step of its input
-UNITS = np.linspace(1.0, 1.4, 24)  # relative weight steps tried per row: the error depends erratically on the step
 FIT_SAMPLES = 8_192
-MIN_SENSITIVITY = 0.05  # of a sample, relative to the mean: the action may be sensitive to the unit elsewhere
-CLIPPED = 0.1  # sensitivity of a clipped action, relative to an unclipped one
-
-
-class UnsupportedNetwork(ValueError):
-    """The kernel cannot represent this network."""
 
 
 def quantize(policy: Policy) -> Kernel:
@@ -104,7 +95,7 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     subset = slice(None, None, max(1, len(x_float) // FIT_SAMPLES))
     activation_ranges = _activation_ranges(layers, policy.activation, x_float)
     x_float, h = x_float[subset], h[subset]
-    sensitivity, of_unit = _sensitivity(policy, layers, x_float, h)
+    slopes, of_unit = sensitivity(policy, layers, x_float, h)
     x = np.clip(np.round(x_float / step), *kernel.input_limits).astype(np.int64)
     dense: list[Dense] = []
     for i, (weight, bias) in enumerate(layers):
@@ -120,7 +111,7 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
             out = _steps(activation_ranges[i], _following(policy, layers, i), MIN_LEVELS)
         else:
             out = np.full(len(bias), TANH_RANGE / (INT16 + 1))
-        dense.append(_dense(weight * step[:, None], target, x, sensitivity[i], out, ridge))
+        dense.append(fitted_layer(weight * step[:, None], target, x, slopes[i], out, ridge))
         if last:
             break
         x = hidden(dense[-1], policy.activation, x)
@@ -138,7 +129,7 @@ def _following(policy: Policy, layers: list[Layer], i: int) -> Floats:
 
 
 def _gated_unit(
-    unit: GatedUnit, x_float: Floats, h_float: Floats, x: Ints, step: Floats, sensitivity: list[Floats], ridge: float
+    unit: GatedUnit, x_float: Floats, h_float: Floats, x: Ints, step: Floats, of_sums: list[Floats], ridge: float
 ) -> tuple[integers.GatedUnit, Ints]:
     """The recurrent unit in integers, and its next h [n, H]; for its inputs in float, and x [n, D] in `step`."""
     h, units = np.round(h_float * INT16).astype(np.int64), h_float.shape[1]
@@ -154,18 +145,18 @@ def _gated_unit(
     memory_shift = int(np.clip(np.round(np.log2(max(size, 1e-9))), 0, np.floor(np.log2(INT16 / MIN_LEVELS))))
     out, lsb, g = TANH_RANGE / (INT16 + 1), np.full(units, 2.0**memory_shift / INT16), integers.shifted(h, memory_shift)
     of_gates, of_input, of_memory = (
-        _dense(weight * lsb[:, None], target, q, slope, np.full(target.shape[1], out), ridge)
+        fitted_layer(weight * lsb[:, None], target, q, slope, np.full(target.shape[1], out), ridge)
         for weight, target, lsb, q, slope, out in (
             (
                 np.concatenate([weight, own])[:, gates],
                 (i + m)[:, gates],
                 np.concatenate([step, lsb]),
                 np.concatenate([x, g], axis=1),
-                sensitivity[0][:, gates],
+                of_sums[0][:, gates],
                 2.0 * out,  # a gate is a tanh of half of its sum
             ),
-            (weight[:, candidate], i[:, candidate], step, x, sensitivity[0][:, candidate], out * 2.0**shift),
-            (own[:, candidate], m[:, candidate], lsb, g, sensitivity[1][:, candidate], out * 2.0**shift),
+            (weight[:, candidate], i[:, candidate], step, x, of_sums[0][:, candidate], out * 2.0**shift),
+            (own[:, candidate], m[:, candidate], lsb, g, of_sums[1][:, candidate], out * 2.0**shift),
         )
     )
     made = integers.GatedUnit(of_gates, of_input, of_memory, shift, memory_shift)
@@ -371,42 +362,6 @@ def _activation_ranges(layers: list[Layer], activation: str, x: Floats) -> list[
     return ranges
 
 
-def _sensitivity(policy: Policy, layers: list[Layer], x: Floats, h: Floats) -> tuple[list[Floats], list[Floats]]:
-    """Per layer: squared derivative [n, outputs] of the action, in full scales, by its outputs before activation; and
-    the same of a recurrent unit's sums.
-    """
-    slopes: list[Floats] = []
-    for weight, bias in layers[:-1]:
-        z = x @ weight + bias
-        x = ACTIVATIONS[policy.activation](z)
-        slopes.append((z > 0).astype(np.float64) if policy.activation == "relu" else 1.0 - x**2)
-    weight, bias = layers[-1]
-    action = (policy.unit(x, h) if policy.unit else x) @ weight + bias
-    low, high = policy.limits
-    gain = np.where((action >= low) & (action <= high), 1.0, CLIPPED) / (high - low)
-    sensitivity = [gain**2]
-    by_action = [gain[:, [k]] * np.eye(len(low))[k] @ weight.T for k in range(len(low))]  # of the last layer's inputs
-    of_unit: list[Floats] = []
-    if unit := policy.unit:
-        r, z, n, own = unit.parts(x, h)
-        of_candidate = (1.0 - z) * (1.0 - n**2)
-        # Of r, z and n, given by the inputs; the memory's part of n is scaled by r.
-        by_sums = [
-            np.concatenate(
-                [d * of_candidate * own * r * (1.0 - r), d * (h - n) * z * (1.0 - z), d * of_candidate], axis=1
-            )
-            for d in by_action
-        ]
-        square = sum(part**2 for part in by_sums) + np.zeros(())
-        of_unit = [square, square * np.concatenate([np.ones_like(z), np.ones_like(z), r**2], axis=1)]
-        by_action = [part @ unit.of_input[0].T for part in by_sums]
-    for i in range(len(slopes) - 1, -1, -1):
-        by_action = [derivative * slopes[i] for derivative in by_action]
-        sensitivity.insert(0, sum(derivative**2 for derivative in by_action) + np.zeros_like(slopes[i]))
-        by_action = [derivative @ layers[i][0].T for derivative in by_action]
-    return sensitivity, of_unit
-
-
 def _steps(ranges: Floats, weight: Floats, levels: int) -> Floats:
     """Steps [inputs] that equalize the rows of `weight` [inputs, outputs], with at least `levels` in each range."""
     finest = ranges / INT16
@@ -419,60 +374,3 @@ def _as_scale(step: Floats) -> tuple[Ints, Ints]:
     """`scale` in [2¹⁵, 2¹⁶) and `exponent` with 1/step ≈ scale·2^(142 − exponent), never a finer step."""
     fraction, power = np.frexp(1.0 / step)  # 1/step = fraction·2^power, fraction in [1/2, 1)
     return np.floor(fraction * 65536).astype(np.int64), (142 + 16 - power).astype(np.int64)
-
-
-def _dense(weight: Floats, target: Floats, x: Ints, sensitivity: Floats, out: Floats, ridge: float) -> Dense:
-    """The layer whose outputs, in steps of `out`, are nearest to `target` [n, outputs] for inputs x [n, inputs].
-
-    `weight` [inputs, outputs] is the float layer's for inputs in steps; `sensitivity` [n, outputs] weights the samples.
-    """
-    # A row of tiny weights keeps a coarse unit, so that its multiplier and its bias keep their precision.
-    ratios = np.abs(weight).max(axis=0) / INT8 / out
-    floor = np.maximum(out * max(ratios.max() / 256.0, 2.0**-20), np.abs(target).max(axis=0) / 2.0**28)
-    x_real = x.astype(np.float64)
-    rows = [_row(weight[:, o], target[:, o], x_real, sensitivity[:, o], ridge, floor[o]) for o in range(len(out))]
-    integers, biases, units = (np.array(column) for column in zip(*rows, strict=True))
-    ratio = units / out
-    shift = int(np.clip(np.floor(np.log2(32767.0 / ratio.max())) - 16, 0, 15))
-    multiplier = np.maximum(np.round(ratio * 2.0 ** (16 + shift)), 1.0)
-    if multiplier.max() > 32767:
-        raise UnsupportedNetwork("a layer amplifies more than its 16-bit outputs can hold")
-    bias = np.round(biases + 2.0 ** (15 + shift) / multiplier)
-    return Dense(integers.astype(np.int64), bias.astype(np.int64), multiplier.astype(np.int64), shift)
-
-
-def _row(
-    weight: Floats, target: Floats, x: Floats, sensitivity: Floats, ridge: float, floor: float
-) -> tuple[Floats, float, float]:
-    """Integers [inputs], bias and unit >= `floor` with unit·(integers·x + bias) near `target` [n].
-
-    The fit is about the mean: the bias absorbs the mean error.
-    """
-    share = sensitivity / max(sensitivity.mean(), 1e-30) + MIN_SENSITIVITY
-    share /= share.sum()
-    mean = share @ x
-    centered = x - mean
-    weighted = centered * share[:, None]
-    second = weighted.T @ centered
-    diagonal = np.diag(second)
-    second += np.diag(ridge * diagonal + 1e-5 * diagonal.mean() + 1e-12)
-    middle = share @ target
-    fitted = weight + np.linalg.solve(second, weighted.T @ (target - middle - centered @ weight))
-    finest = max(float(np.abs(fitted).max()) / INT8, floor)
-    integers = _rounded(fitted / (finest * UNITS[:, None]), second)
-    error = integers * (finest * UNITS[:, None]) - fitted
-    best = int(np.argmin(np.einsum("ui,ij,uj->u", error, second, error)))
-    unit, integers = finest * UNITS[best], integers[best]
-    return integers, (middle - mean @ (integers * unit)) / unit, unit
-
-
-def _rounded(weight: Floats, second: Floats) -> Floats:
-    """Integers in ±127 near each row of `weight` [n, inputs] that keep x·weight; `second`: the second moment of x."""
-    order = np.argsort(-np.diag(second))
-    remaining = weight[:, order]
-    factor = np.linalg.cholesky(np.linalg.inv(second[np.ix_(order, order)])).T
-    result = np.empty_like(weight)
-    for i, place in enumerate(order):
-        result[:, place] = np.clip(np.round(remaining[:, i]), -INT8, INT8)
-        remaining[:, i + 1 :] -= np.outer((remaining[:, i] - result[:, place]) / factor[i, i], factor[i, i + 1 :])
-    return result
