@@ -77,13 +77,16 @@ ROOMS: dict[str, dict[str, Room]] = {
             | {"target", "own_vehicle"},
             MATHS,
         ),
-        "env": Room(
-            {"task", "uncertainty", "pendulum", "quadrotor", "plant", "rewards", "measures", "symmetry"}
+        "task_env": Room({"task", "symmetry"}, MATHS | {"flax.struct"}),
+        "pendulum_env": Room({"task", "task_env", "pendulum", "rewards", "measures", "symmetry"}, MATHS),
+        "quadrotor_env": Room(
+            {"task", "task_env", "uncertainty", "quadrotor", "plant", "rewards", "measures", "symmetry"}
             | {"reference", "target", "own_vehicle"},
-            MATHS | {"flax.struct"},
+            MATHS,
         ),
-        "gymnasium_env": Room({"env", "task"}, MATHS | {"gymnasium"}),
-        "off_nominal": Room({"env", "task", "uncertainty", "plant"}, MATHS),
+        "env": Room({"task", "task_env", "quadrotor_env", "pendulum_env"}, set()),
+        "gymnasium_env": Room({"env", "task", "task_env"}, MATHS | {"gymnasium"}),
+        "off_nominal": Room({"quadrotor_env", "task", "uncertainty", "plant"}, MATHS),
         "viewer": Room({"task", "measures", "io_spec"}, MATHS | {"plotly"}),
         "plots": Room({"task", "measures"}, MATHS | {"matplotlib"}),
         "__init__": Room({"env", "task"}, {"brax", "wrapt"}),
@@ -335,7 +338,10 @@ BROKEN = {
     "gusts": ("qrl_envs/gusts.py", "from qrl_envs import plant", doors, "no door from gusts"),
     "plant": ("qrl_envs/plant.py", "from qrl_envs import env", doors, "no door from plant"),
     "env": ("qrl_envs/env.py", "from qrl_envs import off_nominal", doors, "no door from env to off_nominal"),
-    "env, a library": ("qrl_envs/env.py", "from flax import linen", doors, "libraries of env"),
+    "task_env": ("qrl_envs/task_env.py", "from qrl_envs import plant", doors, "no door from task_env"),
+    "task_env, a library": ("qrl_envs/task_env.py", "from flax import linen", doors, "libraries of task_env"),
+    "pendulum_env": ("qrl_envs/pendulum_env.py", "from qrl_envs import plant", doors, "no door from pendulum_env"),
+    "quadrotor_env": ("qrl_envs/quadrotor_env.py", "from qrl_envs import viewer", doors, "no door from quadrotor_env"),
     "gymnasium_env": ("qrl_envs/gymnasium_env.py", "from qrl_envs import plots", doors, "no door from gymnasium_env"),
     "off_nominal": ("qrl_envs/off_nominal.py", "from qrl_envs import symmetry", doors, "no door"),
     "viewer": ("qrl_envs/viewer/__init__.py", "from qrl_envs import env", doors, "no door from viewer"),
@@ -364,7 +370,8 @@ SOUND = {
     "qrl/export/policy.py": "import json\nimport numpy as np",
     "qrl/cli/main.py": "import re\nimport rich\nimport qrl_envs\nfrom qrl.training import loop\nWORD = re.compile('a')",
     "qrl_envs/__init__.py": "from qrl_envs import env",
-    "qrl_envs/env.py": "from qrl_envs.quadrotor import step",
+    "qrl_envs/env.py": "from qrl_envs.quadrotor_env import QuadrotorEnv",
+    "qrl_envs/quadrotor_env.py": "from qrl_envs.quadrotor import step",
     "qrl_envs/quadrotor.py": "import jax",
     "qrl_envs/rotation.py": "import jax",
 }

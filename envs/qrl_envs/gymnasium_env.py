@@ -16,7 +16,7 @@ from gymnasium.vector.utils import batch_space
 
 from qrl_envs import env as envs
 from qrl_envs import task as tasks
-from qrl_envs.env import State, TaskEnv
+from qrl_envs.task_env import State, TaskEnv
 
 
 class BraxVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):

@@ -11,7 +11,7 @@ import chex
 import jax.numpy as jnp
 
 from qrl_envs import plant
-from qrl_envs.env import RealQuadrotorEnv
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.task import QuadrotorTask
 from qrl_envs.uncertainty import Uncertainty
 

@@ -322,7 +322,7 @@ class PendulumTask(Spec):
 
 Task = QuadrotorTask | PendulumTask
 
-# The fields whose numbers are arguments of a compiled program (env.Params); the other fields shape the program.
+# The fields whose numbers are arguments of a compiled program (task_env.Params); the other fields shape the program.
 TRACED = ("vehicle", "uncertainty", "rod", "start", "bounds", "reward")
 _ANY_TASK = Annotated[Task, Field(discriminator="world")]
 

@@ -9,7 +9,7 @@ import pytest
 
 from qrl.algorithm.adapter import BRAX_EPISODE_STEPS, adapt
 from qrl_envs import env as worlds
-from qrl_envs.env import State
+from qrl_envs.task_env import State
 
 
 class Slider:

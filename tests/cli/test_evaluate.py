@@ -11,7 +11,7 @@ from brax.envs.base import Env, State
 from qrl.algorithm import flights as evaluate
 from qrl.algorithm.flights import Flights
 from qrl_envs import env as worlds
-from qrl_envs.env import Evaluation
+from qrl_envs.task_env import Evaluation
 
 Array = np.ndarray
 

@@ -12,7 +12,7 @@ from cli_helpers import TINY, complaint, qrl
 MODULE = '''
 import jax.numpy as jnp
 from jax import random
-from qrl_envs.env import State
+from qrl_envs.task_env import State
 
 
 class Slider:

@@ -16,7 +16,7 @@ from qrl.algorithm import flights as evaluate
 from qrl.algorithm.flights import Flights
 from qrl_envs import env, measures, quadrotor, symmetry, task
 from qrl_envs.controllers import geometric, lqr, mixer
-from qrl_envs.env import QuadrotorEnv
+from qrl_envs.quadrotor_env import QuadrotorEnv
 
 Array = np.ndarray
 Controller = Callable[[jax.Array], jax.Array]

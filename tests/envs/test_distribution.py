@@ -9,7 +9,7 @@ import pytest
 
 from qrl_envs import own_vehicle, plant, quadrotor, task
 from qrl_envs.distribution import VehicleDistribution
-from qrl_envs.env import RealQuadrotorEnv
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.specfile import BadInput
 
 N = 3000

@@ -17,8 +17,8 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.agents.ppo import train as ppo
 
 import qrl_envs
-from qrl_envs import env, quadrotor, task
-from qrl_envs.env import Lane, TaskEnv
+from qrl_envs import env, quadrotor, task, task_env
+from qrl_envs.task_env import Lane, TaskEnv
 
 Array = np.ndarray
 
@@ -88,7 +88,7 @@ def test_importing_registers_every_shipped_task() -> None:
 def test_it_is_an_environment_of_braxs(any_world: World) -> None:
     """By its type, and by the fields of its state, with their defaults."""
     assert isinstance(any_world.env, Env)
-    ours, theirs = (dataclasses.fields(kind) for kind in (env.State, State))
+    ours, theirs = (dataclasses.fields(kind) for kind in (task_env.State, State))
     assert [(f.name, f.default, f.default_factory) for f in ours] == [
         (f.name, f.default, f.default_factory) for f in theirs
     ]

@@ -11,7 +11,8 @@ import pytest
 
 from qrl.algorithm.analytic_gradient import _constant_leaves
 from qrl_envs import task
-from qrl_envs.env import RealQuadrotorEnv, from_task
+from qrl_envs.env import from_task
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 
 CASES = [
     ("hover", None),

@@ -11,7 +11,7 @@ import pytest
 from brax.envs.base import State
 from gymnasium.envs.classic_control import PendulumEnv as GymPendulum
 
-from qrl_envs import env, pendulum, rewards, task
+from qrl_envs import env, pendulum, rewards, task, task_env
 
 Array = np.ndarray
 
@@ -46,11 +46,13 @@ def in_float64(kind: type, values: object) -> tuple:
 @jax.vmap
 def fly(start: jax.Array, torque: jax.Array) -> tuple[jax.Array, ...]:
     """Our environment from a start [2] under torques [K] in N m, as large as the caller likes."""
-    params = env.Params(in_float64(pendulum.Physics, ROD), in_float64(rewards.SwingUp, REWARD), WORLD.params.start, {})
+    params = task_env.Params(
+        in_float64(pendulum.Physics, ROD), in_float64(rewards.SwingUp, REWARD), WORLD.params.start, {}
+    )
     x = pendulum.Pendulum(start[0], start[1])
     zero = jnp.float32(0.0)
     info = {"truncated": zero, "out_of_bounds": zero}
-    state = State(env.Lane(x, params), pendulum.observe(x), jnp.float64(0.0), zero, {}, info)
+    state = State(task_env.Lane(x, params), pendulum.observe(x), jnp.float64(0.0), zero, {}, info)
 
     def step(state: State, torque: jax.Array) -> tuple[State, State]:
         after = WORLD.step(state, torque[None] / ROD.max_torque_N_m)

@@ -13,7 +13,7 @@ from test_quadrotor import flat, newton_euler
 
 from qrl.export.policy import BodyFrame
 from qrl_envs import noise, plant, quadrotor, rotors, task
-from qrl_envs.env import RealQuadrotorEnv
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.uncertainty import Uncertainty
 
 Array = np.ndarray

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from qrl_envs import plant, quadrotor, reference, specfile, task
-from qrl_envs.env import RealQuadrotorEnv, from_task
+from qrl_envs.env import from_task
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.reference import FixedReference, Random, evaluation_s
 from qrl_envs.specfile import BadInput
 from qrl_envs.target import Figure, Motion, Sines

@@ -10,7 +10,7 @@ import pytest
 from brax.envs.base import State
 from scipy.spatial.transform import Rotation
 
-from qrl_envs import env, rewards, task
+from qrl_envs import env, rewards, task, task_env
 from qrl_envs.quadrotor import Body, Pose, Twist
 
 Array = np.ndarray
@@ -204,7 +204,7 @@ def test_a_step_is_rewarded_for_where_it_ends_and_the_thrust_applied(form: str, 
     asked = np.random.default_rng(2).uniform(-1.5, 1.5, size=(N, 4))
 
     def step(body: Body, action: jax.Array) -> State:
-        start = State(env.Lane(body, world.params), jnp.zeros(18), zero, zero, {}, {"truncated": zero})
+        start = State(task_env.Lane(body, world.params), jnp.zeros(18), zero, zero, {}, {"truncated": zero})
         return world.step(start, action)
 
     with jax.enable_x64(False):

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from qrl_envs import noise, task
-from qrl_envs.env import RealQuadrotorEnv
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.uncertainty import Uncertainty
 
 Array = np.ndarray

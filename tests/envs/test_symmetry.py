@@ -14,9 +14,9 @@ from qrl.algorithm.types import Transition
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
 from qrl_envs import task as tasks
-from qrl_envs.env import TaskEnv
 from qrl_envs.symmetry import Symmetry
 from qrl_envs.target import Sines
+from qrl_envs.task_env import TaskEnv
 
 DRAWS = 64
 PLUS = {

@@ -35,8 +35,8 @@ from qrl.runs import record
 from qrl.runs.record import RunConfig
 from qrl_envs import io_spec
 from qrl_envs import task as task_spec
-from qrl_envs.env import RealQuadrotorEnv
 from qrl_envs.plant import integrator
+from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.specfile import BadInput
 from qrl_envs.task import QuadrotorTask, Task
 from qrl_envs.vehicle import shipped_vehicles
