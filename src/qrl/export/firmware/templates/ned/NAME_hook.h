@@ -52,7 +52,7 @@ typedef struct {
     float position_m[3];
     float velocity_m_s[3];
     float attitude[4];    /* unit quaternion w, x, y, z: body to world; @name@_quaternion makes one of roll, pitch, yaw */
-    float rates_rad_s[3]; /* about front, right, down. Betaflight's gyro has deg/s */
+    float rates_rad_s[3]; /* about front, right, down; not in deg/s */
     uint32_t position_us; /* when a position was last measured */
     uint32_t attitude_us; /* when the attitude was estimated */
 } @name@_estimate;
