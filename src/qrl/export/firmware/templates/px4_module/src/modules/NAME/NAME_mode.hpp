@@ -40,13 +40,9 @@ public:
 	@class@();
 	~@class@() override;
 
-	/** @see ModuleBase */
+	// Of ModuleBase.
 	static int task_spawn(int argc, char *argv[]);
-
-	/** @see ModuleBase */
 	static int custom_command(int argc, char *argv[]);
-
-	/** @see ModuleBase */
 	static int print_usage(const char *reason = nullptr);
 
 	/** Whether the self-test passed; if not, the mode is not registered. */
