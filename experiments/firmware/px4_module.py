@@ -112,7 +112,8 @@ class Module:
         if not hook.exists():
             _run("gcc", *of_c, "-O1", *common, "-c", str(out / f"{name}_hook.c"), "-o", str(hook))
         objects = str(SHIM), str(hook), str(kernel)
-        _run("g++", *of_cxx, "-O0", "-shared", *common, *defines, *system, *objects, "-lm", "-o", str(library))
+        lean = ("-O0", "-shared", "-fno-rtti", "-fno-exceptions", "-nostdlib")
+        _run("g++", *of_cxx, *lean, *common, *defines, *system, *objects, "-lm", "-lc", "-o", str(library))
         self.c = ctypes.CDLL(str(library))
         self.c.boot.restype, self.c.name.restype = ctypes.c_void_p, ctypes.c_char_p
         self.c.quiet(1)

@@ -4,6 +4,13 @@
  */
 #include <px4_stub.hpp>
 
+#include <cstdlib>
+
+/* Without the library of C++, as in PX4; it is much to link for each mistake. */
+void *operator new(std::size_t size) { return std::malloc(size); }
+void operator delete(void *pointer) noexcept { std::free(pointer); }
+void operator delete(void *pointer, std::size_t) noexcept { std::free(pointer); }
+
 namespace shim { int offboard = 0; }
 #define DEFINE_PARAMETERS(...) Parameter _param_offboard{&shim::offboard};
 

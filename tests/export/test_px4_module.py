@@ -124,12 +124,22 @@ def test_a_self_test_that_fails_registers_no_mode(tmp_path: Path) -> None:
     assert not module.c.asked()
 
 
+# `experiments.firmware.px4_module` has them, too; each is to be compiled.
+LEFT_OUT = {
+    *("north and east swapped", "velocity down the other way", "quaternion conjugated", "rates left out"),
+    *("heading the other way", "motors front and back swapped", "commands halved", "ages ignored"),
+    *("take-over at boot alone", "arming check always granted", "set-point does not age", "orders at each sample"),
+    *("holds the heading north", "a set-point without a heading", "a registration refused", "not unregistered"),
+}
+
+
 def test_it_flies_as_the_kernel_does_and_mistakes_do_not(tmp_path: Path) -> None:
     """In the plant at 400 Hz along a circle, with a heading: apart from the bare kernel by less than 1 mm; each mistake
     falls, strays by more than 1 cm, or breaks a rule.
     """
-    policy, n, seconds = steady(), 2, 1.0
-    folder, kernel, wrong = emitted(policy, tmp_path), quantize(policy), modules.mistakes(NAME)
+    policy, n, seconds = steady(), 2, 0.6
+    folder, kernel = emitted(policy, tmp_path), quantize(policy)
+    wrong = {what: mutants for what, mutants in modules.mistakes(NAME).items() if what not in LEFT_OUT}
     right = Module(folder, NAME, tmp_path / "right")
     mutants = [Module(folder, NAME, tmp_path / f"mistake{i}", *each) for i, each in enumerate(wrong.values())]
     vehicles = [module.boot().register() for module in [right] * n + mutants]
