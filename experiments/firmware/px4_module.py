@@ -333,8 +333,7 @@ def _ages(module: Module) -> Iterator[str]:
         vehicle.tick(BEGIN_US + 30_000, row, mode=0)
         if not vehicle.tick(BEGIN_US + 40_000, row, mode=0, check=1).able:
             yield "a number that was not one stays"
-    vehicle = _on(module)
-    bad[:] = np.where(np.arange(27) == 0, np.nan, row)
+    vehicle, bad = _on(module), np.where(np.arange(27) == 0, np.nan, row)
     vehicle.tick(BEGIN_US, bad)
     vehicle.tick(BEGIN_US + 10_000, bad, mode=0)
     if not vehicle.tick(BEGIN_US + 20_000, row, mode=0, check=1).able:
