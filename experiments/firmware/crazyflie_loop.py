@@ -238,7 +238,7 @@ def by_kernel(
 
     `preview(t)` [3k]: of the reference, world; at rest without.
     """
-    every, previews = round(policy.control_period_s / STEP_S), len(policy.observations) - 18
+    every, previews = round(policy.control_period_s / world.step_s), len(policy.observations) - 18
     speeds, c = policy.actions[0].quantity is not None, world.vehicle.thrust_curve
     of_port = [CORNERS.index(corner(port.position_m)) for port in policy.actions]
     order = [of_port.index(motor) for motor in world.crazyflie]  # the action of each motor of the vehicle
@@ -251,7 +251,7 @@ def by_kernel(
             turn = np.array([[c_yaw, s_yaw, 0.0], [-s_yaw, c_yaw, 0.0], [0.0, 0.0, 1.0]])
             attitude = turn @ np.asarray(_matrices(jnp.asarray(state[:, 6:10], jnp.float32)))
             relative = [(state[:, 0:3] - now.position_m) @ turn.T, (state[:, 3:6] - now.velocity_m_s) @ turn.T]
-            ahead = (preview(step * STEP_S) if preview else np.zeros(previews)).reshape(-1, 3) @ turn.T
+            ahead = (preview(step * world.step_s) if preview else np.zeros(previews)).reshape(-1, 3) @ turn.T
             parts = [attitude.reshape(n, 9), *relative, state[:, 10:13], np.broadcast_to(ahead.ravel(), (n, previews))]
             obs = np.concatenate(parts, axis=1).astype(np.float32)
             memory, _, action = reference.step(kernel, memory, obs)

@@ -366,7 +366,7 @@ def fly(args: argparse.Namespace) -> int:
     if missing := [path for path in NEEDED if not (args.px4 / path).exists()]:
         raise BadInput(f"--px4 {args.px4}: expected PX4-Autopilot with its submodules, found no {missing[0]}")
     policy = TrainedRun.load(args.run).policy()
-    if reason := px4.refusal(policy):
+    if reason := px4.checkpoint_refusal(policy):
         raise BadInput(f"{args.run}: no {px4.FILE} for mc_raptor: {reason}")
     task = tasks.load("hover", args.vehicle)
     assert isinstance(task, QuadrotorTask)

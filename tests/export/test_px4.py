@@ -33,6 +33,7 @@ SHAPES = {
     "example/output": (500, 2, 4),
 }
 RAPTOR = ["FR", "BR", "BL", "FL"]  # its motors
+KERNEL = {"x.c": "", "x.h": ""}
 CORNERS = {(1, -1): "FR", (-1, -1): "BR", (-1, 1): "BL", (1, 1): "FL"}  # signs of x forward, y left
 
 
@@ -156,7 +157,7 @@ def test_the_example_is_what_the_network_gives() -> None:
 
 def test_refusals() -> None:
     good = shaped()
-    assert px4.refusal(good) is None
+    assert px4.checkpoint_refusal(good) is None
     memory = good.memory
     assert memory
     first, last = good.layers
@@ -179,13 +180,13 @@ def test_refusals() -> None:
         (replace(good, actions=swapped), "the motors are not"),
     ]
     for policy, reason in bad:
-        assert reason in (px4.refusal(policy) or "")
-        assert px4.files(policy, {}, "x") == {}
+        assert reason in (px4.checkpoint_refusal(policy) or "")
+        assert f"px4/{px4.FILE}" not in px4.files(policy, KERNEL, "x")
         assert reason in px4.section(policy)
 
 
 def test_the_readme_has_no_placeholder_left() -> None:
-    readme = px4.files(shaped(), {}, "mine")["px4/README.md"]
+    readme = px4.files(shaped(), {"mine.c": "", "mine.h": ""}, "mine")["px4/README.md"]
     assert isinstance(readme, str)
     assert readme.startswith("# mine on PX4")
     assert "@" not in readme

@@ -4,9 +4,9 @@ Facts of Indiflight, whose neural controller it can be, are those of its `src/ma
 `src/main/fc/core.c` at 15b7626; the order and the spins of motors those of Betaflight's mixer QUADX.
 """
 
-from qrl.export.firmware import vehicle
-from qrl.export.firmware.vehicle import Corner, c_float
-from qrl.export.policy import WORLD_SIZE, Policy
+from qrl.export.firmware import ned, vehicle
+from qrl.export.firmware.vehicle import Corner
+from qrl.export.policy import Policy
 
 TITLE, FOLDER = "Betaflight, Indiflight", "betaflight"
 WHAT = "a hook"
@@ -16,6 +16,7 @@ MOTORS = (  # with propellers that turn inwards at the front, as it is set up at
     Corner("rear left (3)", -1, 1, -1),
     Corner("front left (4)", 1, 1, 1),
 )
+HOOK = ned.Firmware("Betaflight and its relatives", "Betaflight's quad X", 250_000, 20_000, 1_000_000)
 
 
 def refusal(policy: Policy) -> str | None:
@@ -43,7 +44,11 @@ def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
     """The hook of a policy: path in the export folder -> text; none with a `refusal`. `kernel`: NAME.c and NAME.h."""
     if refusal(policy):
         return {}
-    texts = vehicle.filled(FOLDER, _values(policy, name), name)
+    found = motors(policy)
+    assert not isinstance(found, str), found
+    order, reversed_ = found
+    texts = ned.files(policy, name, HOOK, MOTORS, order)
+    texts |= vehicle.filled(FOLDER, _values(policy, name, reversed_), name)
     texts |= {file: kernel[file] for file in (f"{name}.c", f"{name}.h")}
     return {f"{FOLDER}/{path}": text for path, text in texts.items()}
 
@@ -57,49 +62,18 @@ def section(policy: Policy) -> str:
     return f"\n## {TITLE}\n\n{said}\n"
 
 
-def _values(policy: Policy, name: str) -> dict[str, str]:
+def _values(policy: Policy, name: str, reversed_: bool) -> dict[str, str]:
     """Values of the templates' @placeholders@."""
-    found = motors(policy)
-    assert not isinstance(found, str), found
-    order, reversed_ = found
-    ports = [policy.actions[i] for i in order]
     return {
         "name": name,
         "NAME": name.upper(),
         "period_ms": f"{policy.control_period_s * 1e3:g}",
         "rate_hz": f"{1.0 / policy.control_period_s:.0f}",
-        **{f"m{number}": port.name.upper() for number, port in enumerate(ports, 1)},
-        **{f"most{number}": c_float(port.high) for number, port in enumerate(ports, 1)},
-        "preview": vehicle.preview(policy, name, "setpoint->acceleration_m_s2[{i}]", "setpoint->jerk_m_s3[{i}]"),
-        "fraction": SPEED if vehicle.orders_speeds(policy) else THRUST.format(c=c_float(ports[0].thrust_curve)),
-        "command": "the rotor's speed, of its greatest, 0 to 1",
+        "command": ned.COMMAND,
         "spins": OUTWARDS if reversed_ else INWARDS,
-        "facts": "\n".join(f"- {line}" for line in facts(policy)),
+        "facts": "\n".join(f"- {line}" for line in ned.facts(policy)),
     }
 
 
 INWARDS = "the front propellers turn inwards (yaw_motors_reversed = OFF)"
 OUTWARDS = "the front propellers turn outwards (yaw_motors_reversed = ON)"
-SPEED = "    const float share = of_most; /* it is a rotor's speed */"
-THRUST = """\
-    /* A thrust, of the greatest: c w + (1 - c) w^2 of a rotor's speed w, as the vehicle was trained with. */
-    const float c = {c}, thrust = of_most > 0.0f ? of_most : 0.0f;
-    const float share = c < 1.0f ? (sqrtf(c * c + 4.0f * (1.0f - c) * thrust) - c) / (2.0f * (1.0f - c)) : thrust;"""
-
-
-def facts(policy: Policy) -> list[str]:
-    """What to know of the policy before flight, a sentence each."""
-    found = vehicle.facts(policy)
-    if vehicle.orders_speeds(policy):
-        found.append("It was trained on many vehicles and is told nothing of yours.")
-    else:
-        most_N = max(port.high for port in policy.actions)
-        found.append(
-            f"Trained to fly {vehicle.mass_kg(policy) * 1e3:.0f} g with motors {vehicle.arm_m(policy) * 1e3:.0f} mm"
-            f" from the center and of up to {most_N:.3g} N each. Weigh yours, and measure its thrust."
-        )
-    if len(policy.observations) > WORLD_SIZE:
-        found.append(
-            "It looks ahead: give the set-point's acceleration and jerk, or the reference is taken to go straight on."
-        )
-    return found

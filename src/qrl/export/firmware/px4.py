@@ -1,24 +1,35 @@
-"""The checkpoint that PX4's module mc_raptor loads from its SD card, of a policy of RAPTOR's shape (docs/px4.md).
+"""For PX4: a module around any kernel, and of RAPTOR's shape the checkpoint that mc_raptor loads (docs/px4.md).
 
-A tar file of the archive format ustar, as RLtools (Eschmann et al.) writes and reads it: for each tensor an entry
-`…/meta` of lines `key: value` and an entry `…/data`, little-endian float32, row-major. Facts of PX4 are those of
-`src/modules/mc_raptor` of its main branch before v1.18, of RLtools those of its commit 9acdf5c.
+The checkpoint is a tar file of the archive format ustar, as RLtools (Eschmann et al.) writes and reads it: for each
+tensor an entry `…/meta` of lines `key: value` and an entry `…/data`, little-endian float32, row-major. Facts of PX4 are
+those of `src/modules/mc_raptor` of its main branch before v1.18, of RLtools those of its commit 9acdf5c.
 """
 
 import io
 import re
 import tarfile
+import zlib
 
 import numpy as np
 from numpy.typing import NDArray
 
-from qrl.export.firmware import vehicle
+from qrl.export.firmware import ned, vehicle
 from qrl.export.firmware.vehicle import Corner
 from qrl.export.policy import Policy, sigmoid
 
 TITLE, FOLDER, FILE = "PX4", "px4", "policy.tar"
-WHAT = f"{FILE} for its module mc_raptor"
+WHAT = "a module for it, or the file of its mc_raptor"
 RELEASE = "v1.18"
+QUAD_X = (  # the module's motors: PX4's quadrotor X
+    Corner("front right (1)", 1, -1, -1),
+    Corner("back left (2)", -1, 1, -1),
+    Corner("front left (3)", 1, 1, 1),
+    Corner("back right (4)", -1, -1, 1),
+)
+# Ages as mc_raptor has them; that of the set-point is seen to outside of the hook.
+HOOK = ned.Firmware("PX4", "PX4's quadrotor X", 100_000, 50_000, 200_000)
+MOST_MODE, MOST_PARAMETER = 24, 16  # characters of PX4's names
+
 HIDDEN, UNITS = 16, 16
 # Its actions: of RAPTOR's quadrotor, whose order is the Crazyflie's; mc_raptor renumbers them to PX4's quadrotor X.
 MOTORS = (
@@ -38,6 +49,14 @@ Floats = NDArray[np.floating]
 
 
 def refusal(policy: Policy) -> str | None:
+    """Why there is no module for a policy, in one line; None if there is."""
+    if reason := vehicle.misfit(policy):
+        return reason
+    order = vehicle.by_place_and_spin(policy, QUAD_X)
+    return f"of PX4's quadrotor X, {order}" if isinstance(order, str) else None
+
+
+def checkpoint_refusal(policy: Policy) -> str | None:
     """Why mc_raptor cannot fly a policy, in one line; None if it can."""
     memory = policy.memory
     measured = [port.name for port in policy.observations] == vehicle.MEASURED
@@ -63,7 +82,7 @@ def refusal(policy: Policy) -> str | None:
 def tensors(policy: Policy) -> dict[str, NDArray[np.float32]]:
     """The parameters by name, for inputs and outputs in mc_raptor's order and units: actions in [−1, 1].
 
-    No `refusal`.
+    No `checkpoint_refusal`.
     """
     motors = vehicle.by_place_and_spin(policy, MOTORS)
     assert not isinstance(motors, str), motors
@@ -148,18 +167,65 @@ def _tensor(path: str, values: NDArray[np.float32]) -> dict[str, bytes]:
 
 
 def files(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str | bytes]:
-    """Path in the export folder -> contents; none with a `refusal`. The kernel in C is not of use to it."""
-    del kernel
-    if refusal(policy):
+    """Path in the export folder -> contents: the module and the checkpoint, where there is no refusal.
+
+    `kernel`: NAME.c and NAME.h.
+    """
+    if refusal(policy) and checkpoint_refusal(policy):
         return {}
-    values = {"name": name, "release": RELEASE, "facts": "\n".join(f"- {fact}" for fact in facts(policy))}
+    checkpoint, module = said(policy)
+    values = {"name": name, "release": RELEASE, "checkpoint": checkpoint, "module": module}
+    values["facts"] = "\n".join(f"- {fact}" for fact in facts(policy))
     texts = vehicle.filled(FOLDER, values, name)
-    run = f"{policy.provenance.run} {policy.provenance.env_steps} {name}"
-    return {f"{FOLDER}/{path}": text for path, text in texts.items()} | {f"{FOLDER}/{FILE}": archive(policy, run)}
+    found: dict[str, str | bytes] = {"README.md": texts["README.md"]}
+    if not refusal(policy):
+        found |= {f"module/{path}": text for path, text in _module(policy, kernel, name).items()}
+    if not checkpoint_refusal(policy):
+        run = f"{policy.provenance.run} {policy.provenance.env_steps} {name}"
+        found |= {"README.md": texts["README.md"] + texts["checkpoint.md"], FILE: archive(policy, run)}
+    return {f"{FOLDER}/{path}": contents for path, contents in found.items()}
+
+
+def _module(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]:
+    """Path in the folder for EXTERNAL_MODULES_LOCATION -> text."""
+    order = vehicle.by_place_and_spin(policy, QUAD_X)
+    assert not isinstance(order, str), order
+    values = {
+        "name": name,
+        "NAME": name.upper(),
+        "class": "".join(part.capitalize() for part in name.split("_")) + "Mode",
+        "mode": name[:MOST_MODE],
+        "parameter": f"{name.upper()[: MOST_PARAMETER - len(OFFBOARD)]}{OFFBOARD}",
+        "request_id": str(zlib.crc32(name.encode())),
+        "description": " ".join(policy.provenance.description.split()),
+        "command": ned.COMMAND,
+        "rate_hz": f"{1.0 / policy.control_period_s:.0f}",
+        "release": RELEASE,
+        "facts": "\n".join(f"- {fact}" for fact in ned.facts(policy)),
+    }
+    hook = ned.files(policy, name, HOOK, QUAD_X, order)
+    source = hook | {file: kernel[file] for file in (f"{name}.c", f"{name}.h")}
+    return vehicle.filled("px4_module", values, name) | {
+        f"src/modules/{name}/{path}": text for path, text in source.items()
+    }
+
+
+OFFBOARD = "_OFFB"
+
+
+def said(policy: Policy, where: str = "") -> tuple[str, str]:
+    """Of the checkpoint and of the module, in the folder `where`: what it is for, or why there is none."""
+    reason, other = checkpoint_refusal(policy), refusal(policy)
+    return (
+        f"No `{where}{FILE}`: {reason}."
+        if reason
+        else f"`{where}{FILE}`: for PX4's mode mc_raptor, without a compiler.",
+        f"No `{where}module/`: {other}." if other else f"`{where}module/`: to be built with PX4; its README says how.",
+    )
 
 
 def facts(policy: Policy) -> list[str]:
-    """What to know of the policy before flight, a sentence each."""
+    """What to know of a policy of RAPTOR's shape before flight, a sentence each."""
     return [
         vehicle.facts(policy)[0],
         "It holds a place or follows `trajectory_setpoint`; it sees no set-point ahead, and lags one that moves.",
@@ -173,8 +239,5 @@ def section(policy: Policy) -> str:
     """What report.md says of it; nothing of a policy that flies no vehicle."""
     if not vehicle.flies(policy):
         return ""
-    reason = refusal(policy)
-    said = (
-        f"No {FILE}: {reason}." if reason else f"`{FOLDER}/{FILE}` is for mc_raptor; the README there says how to fly."
-    )
-    return f"\n## {TITLE}\n\n{said}\n"
+    lines = "".join(f"- {line}\n" for line in said(policy, f"{FOLDER}/"))
+    return f"\n## {TITLE}\n\n{lines}"

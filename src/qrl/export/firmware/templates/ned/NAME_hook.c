@@ -80,10 +80,10 @@ static int step(@name@_hook *hook, const @name@_estimate *estimate, const @name@
     if (hook->status == 2) {
         return @NAME@_NOT_FINITE;
     }
-    hook->motor[0] = command(act[@NAME@_ACT_@m1@] / @most1@); /* 1: rear right */
-    hook->motor[1] = command(act[@NAME@_ACT_@m2@] / @most2@); /* 2: front right */
-    hook->motor[2] = command(act[@NAME@_ACT_@m3@] / @most3@); /* 3: rear left */
-    hook->motor[3] = command(act[@NAME@_ACT_@m4@] / @most4@); /* 4: front left */
+    hook->motor[0] = command(act[@NAME@_ACT_@m1@] / @most1@); /* @motor1@ */
+    hook->motor[1] = command(act[@NAME@_ACT_@m2@] / @most2@); /* @motor2@ */
+    hook->motor[2] = command(act[@NAME@_ACT_@m3@] / @most3@); /* @motor3@ */
+    hook->motor[3] = command(act[@NAME@_ACT_@m4@] / @most4@); /* @motor4@ */
     return @NAME@_FLIES;
 }
 
@@ -104,24 +104,34 @@ void @name@_hook_stop(@name@_hook *hook) {
     hook->who = @NAME@_OFF;
 }
 
+int @name@_hook_check(const @name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint,
+                      const uint32_t now_us) {
+    /* A time may be a little ahead of now, where an interrupt stamps it: its age is then 0. */
+    const int32_t position_age = (int32_t)(now_us - estimate->position_us);
+    const int32_t attitude_age = (int32_t)(now_us - estimate->attitude_us);
+    const int32_t setpoint_age = (int32_t)(now_us - setpoint->received_us);
+    if (!hook->tested) {
+        return @NAME@_SELFTEST;
+    }
+    if (!usable(estimate, setpoint)) {
+        return @NAME@_NOT_FINITE;
+    }
+    if (position_age > @NAME@_POSITION_US) {
+        return @NAME@_POSITION_OLD;
+    }
+    if (attitude_age > @NAME@_ATTITUDE_US) {
+        return @NAME@_ATTITUDE_OLD;
+    }
+    return setpoint_age > @NAME@_SETPOINT_US ? @NAME@_SETPOINT_OLD : @NAME@_FLIES;
+}
+
 int @name@_hook_run(@name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint,
                     const uint32_t now_us, float motor[4]) {
     if (hook->who != @NAME@_FLIES) {
         return hook->who;
     }
-    /* A time may be a little ahead of now, where an interrupt stamps it: its age is then 0. */
-    const int32_t position_age = (int32_t)(now_us - estimate->position_us);
-    const int32_t attitude_age = (int32_t)(now_us - estimate->attitude_us);
-    const int32_t setpoint_age = (int32_t)(now_us - setpoint->received_us);
-    if (!usable(estimate, setpoint)) {
-        hook->who = @NAME@_NOT_FINITE;
-    } else if (position_age > @NAME@_POSITION_US) {
-        hook->who = @NAME@_POSITION_OLD;
-    } else if (attitude_age > @NAME@_ATTITUDE_US) {
-        hook->who = @NAME@_ATTITUDE_OLD;
-    } else if (setpoint_age > @NAME@_SETPOINT_US) {
-        hook->who = @NAME@_SETPOINT_OLD;
-    } else if ((int32_t)(now_us - hook->next_us) >= 0) {
+    hook->who = @name@_hook_check(hook, estimate, setpoint, now_us);
+    if (hook->who == @NAME@_FLIES && (int32_t)(now_us - hook->next_us) >= -@NAME@_EARLY_US) {
         hook->who = step(hook, estimate, setpoint);
         hook->next_us += @NAME@_PERIOD_US;
         if ((int32_t)(now_us - hook->next_us) >= 0) { /* late by a whole period: what was missed is not caught up */

@@ -1,5 +1,5 @@
 /*
- * @name@.c for firmware that estimates north, east, down and front, right, down: Betaflight and its relatives.
+ * @name@.c for firmware that estimates north, east, down and front, right, down: @firmware@.
  *
  * Call @name@_hook_init once at boot, @name@_hook_start when the pilot hands over, then @name@_hook_run in every loop of the
  * motors, whatever its rate: the policy runs every @period_ms@ ms, and its motor commands hold between. While
@@ -15,15 +15,24 @@
 
 #include "@name@.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* Ages above which the policy does not fly [us]. */
 #ifndef @NAME@_POSITION_US
-#define @NAME@_POSITION_US 250000 /* of the last measured position: the estimate drifts from there on */
+#define @NAME@_POSITION_US @position_us@ /* of the last measured position: the estimate drifts from there on */
 #endif
 #ifndef @NAME@_ATTITUDE_US
-#define @NAME@_ATTITUDE_US 20000
+#define @NAME@_ATTITUDE_US @attitude_us@
 #endif
 #ifndef @NAME@_SETPOINT_US
-#define @NAME@_SETPOINT_US 1000000
+#define @NAME@_SETPOINT_US @setpoint_us@
+#endif
+
+/* A call that is early by this much is on time: clocks and interrupts jitter [us]. */
+#ifndef @NAME@_EARLY_US
+#define @NAME@_EARLY_US 500
 #endif
 
 /* What @name@_hook_run returns. */
@@ -43,7 +52,7 @@ typedef struct {
     float position_m[3];
     float velocity_m_s[3];
     float attitude[4];    /* unit quaternion w, x, y, z: body to world; @name@_quaternion makes one of roll, pitch, yaw */
-    float rates_rad_s[3]; /* about front, right, down. Betaflight's gyro has deg/s */
+    float rates_rad_s[3]; /* about front, right, down; not in deg/s */
     uint32_t position_us; /* when a position was last measured */
     uint32_t attitude_us; /* when the attitude was estimated */
 } @name@_estimate;
@@ -76,13 +85,21 @@ void @name@_hook_start(@name@_hook *hook, uint32_t now_us);
 /* Gives control back. */
 void @name@_hook_stop(@name@_hook *hook);
 
+/* Whether the policy could fly now: @NAME@_FLIES, or the fault. */
+int @name@_hook_check(const @name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint,
+                      uint32_t now_us);
+
 /* One loop of the motors. Returns who flies; only with @NAME@_FLIES are commands written to motor: @command@.
- * Order: Betaflight's quad X: 1 rear right, 2 front right, 3 rear left, 4 front left. Times may wrap around. */
+ * Order: @order@. Times may wrap around. */
 int @name@_hook_run(@name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint, uint32_t now_us,
                     float motor[4]);
 
 /* The quaternion of roll, pitch and yaw [rad], turned in the order yaw, pitch, roll: body front, right, down to north, east,
  * down. */
 void @name@_quaternion(float roll_rad, float pitch_rad, float yaw_rad, float attitude[4]);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif
