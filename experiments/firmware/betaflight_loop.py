@@ -13,7 +13,7 @@ from experiments.firmware.crazyflie_loop import Floats, Mutant, World
 from qrl.export.firmware import betaflight
 
 FLIP = np.array([1.0, -1.0, -1.0])  # front, left, up <-> front, right, down; and of the world
-FLIES, OFF, POSITION_OLD, ATTITUDE_OLD, SETPOINT_OLD, NOT_FINITE, SELFTEST = range(7)
+OFF, FLIES, POSITION_OLD, ATTITUDE_OLD, SETPOINT_OLD, NOT_FINITE, SELFTEST = range(7)
 NOW_US = 2**32 - 600_000  # the clock wraps around in mid-flight
 WARNINGS = ("-Wall", "-Wextra", "-Werror", "-Wconversion", "-Wdouble-promotion")
 STRICT = ("-std=c99", "-pedantic", *WARNINGS)
@@ -107,22 +107,22 @@ class Hook:
         (out / f"{name}_hook.c").write_text(mutated((folder / f"{name}_hook.c").read_text(), mutants))
         (out / "shim.c").write_text(HOOK.format(name=name))
         self.c, self._name = compiled(out / "shim.c", folder, name, () if mutants else STRICT), name
-        self._hooks: list[ctypes.Array[ctypes.c_char]] = []
+        self.hooks: list[ctypes.Array[ctypes.c_char]] = []
 
     def boot(self) -> int:
         """One more vehicle; its number. RuntimeError if its self-test fails."""
-        self._hooks.append(ctypes.create_string_buffer(self.c.size()))
-        if not self.c[f"{self._name}_hook_init"](self._hooks[-1]) & 1:
+        self.hooks.append(ctypes.create_string_buffer(self.c.size()))
+        if not self.c[f"{self._name}_hook_init"](self.hooks[-1]) & 1:
             raise RuntimeError("the self-test failed")
-        return len(self._hooks) - 1
+        return len(self.hooks) - 1
 
     def start(self, vehicle: int, now_us: int) -> None:
-        self.c[f"{self._name}_hook_start"](self._hooks[vehicle], ctypes.c_uint32(now_us))
+        self.c[f"{self._name}_hook_start"](self.hooks[vehicle], ctypes.c_uint32(now_us))
 
     def run(self, vehicle: int, estimate: Estimate, to: SetPoint, now_us: int) -> tuple[int, Floats]:
         motor = (ctypes.c_float * 4)(*[math.nan] * 4)
         call = self.c[f"{self._name}_hook_run"]
-        who = call(self._hooks[vehicle], ctypes.byref(estimate), ctypes.byref(to), ctypes.c_uint32(now_us), motor)
+        who = call(self.hooks[vehicle], ctypes.byref(estimate), ctypes.byref(to), ctypes.c_uint32(now_us), motor)
         return who, np.array(motor)
 
     def quaternion(self, roll_rad: float, pitch_rad: float, yaw_rad: float) -> Floats:

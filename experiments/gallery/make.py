@@ -78,7 +78,7 @@ def gallery(out: Path, runs: Path, *, fast: bool, fresh: bool) -> None:
 
 
 def evaluate_preset(task: str, folder: Path, *, fresh: bool) -> PresetResult:
-    """Train the shipped preset with seed 0 and evaluate it beside the controllers and PPO."""
+    """Train the shipped preset with a held-out seed and evaluate it beside the controllers and PPO."""
     ours, ppo = RunSpec(task, task, task, {}), RunSpec(f"{task}-ppo", task, f"{task}_ppo", {})
     for one in (ours, ppo):
         ensure_run(one, folder / one.name, fresh=fresh)

@@ -20,6 +20,7 @@ from qrl.evaluation.trained_run import TrainedRun, inputs_in_si, vehicle_name
 from qrl.export.kernel import AccumulatorOverflow
 from qrl.export.policy import Memory, Policy
 from qrl.export.quantize import UnsupportedNetwork
+from qrl.export.report import with_warnings
 from qrl.export.targets import VerificationFailed
 from qrl_envs.task import QuadrotorTask
 from qrl_envs.vehicle import shipped_vehicles
@@ -108,6 +109,13 @@ def test_a_verification_that_fails_leaves_what_was_there(
         assert contents(run) == before
         assert (run / "export").exists() == had
         assert not list(run.glob(".*"))
+
+
+def test_an_adapters_readme_begins_with_what_failed() -> None:
+    page = "# hover on a vehicle\n\nCopy it.\n"
+    assert with_warnings(page, []) == page
+    title, _, first, *_, last = with_warnings(page, ["> **Warning: failed: …**"]).splitlines()
+    assert (title, first, last) == ("# hover on a vehicle", "> **Warning: failed: …**", "Copy it.")
 
 
 @pytest.mark.usefixtures("calibrated")
@@ -226,7 +234,8 @@ def test_a_policy_with_all_that_a_task_gives_it_exports(
     assert {path.name for path in (run / "export" / "crazyflie" / "src").iterdir()} > {manifest["name"] + ".c"}
     assert "`crazyflie/` is an app" in (run / "export" / "report.md").read_text()
     assert (run / "export" / "px4" / "policy.tar").exists() == (task == "raptor")
-    assert ("No policy.tar: the inputs" in (run / "export" / "report.md").read_text()) == (task != "raptor")
+    assert ("No `px4/policy.tar`: the inputs" in (run / "export" / "report.md").read_text()) == (task != "raptor")
+    assert (run / "export" / "px4" / "module" / "README.md").read_text().splitlines()[2].startswith("> **Warning: ")
 
 
 @pytest.mark.parametrize("name", shipped_vehicles())

@@ -221,13 +221,12 @@ def test_others_are_drawn_beside_by_their_medians() -> None:
     assert drawn(share)[0].min() == 100.0
 
 
-def test_a_long_name_is_told_by_its_end() -> None:
+def test_a_path_is_told_by_as_little_of_its_end_as_tells_it_apart() -> None:
     flights = np.zeros((FLIGHTS, SAMPLES, 18))
-    figure = errors_of.figure(
-        task.load("hover"), flights, {"experiments/out/gallery/circle-ppo": flights, "a/b": flights}
-    )
+    others = dict.fromkeys(["experiments/out/gallery/circle-ppo", "a/b", "runs/a/b"], flights)
+    figure = errors_of.figure(task.load("hover"), flights, others)
     labels = {line.get_label() for axes in figure.axes for line in axes.lines}
-    assert {"median of …/out/gallery/circle-ppo", "median of a/b"} <= labels
+    assert {"median of circle-ppo", "median of a/b", "median of runs/a/b"} <= labels
 
 
 def test_the_map_has_medians_by_tilt_and_speed() -> None:

@@ -1,5 +1,6 @@
 """The hook for Betaflight: for whom there is one; it flies as the bare kernel does, and mistakes in it show."""
 
+import ctypes
 import math
 import re
 import shutil
@@ -24,6 +25,7 @@ from experiments.firmware.betaflight_loop import (
     NOT_FINITE,
     OFF,
     POSITION_OLD,
+    SELFTEST,
     SETPOINT_OLD,
     Estimate,
     Hook,
@@ -120,6 +122,16 @@ def test_it_compiles_for_a_flight_controller(make: object, tmp_path: Path) -> No
         subprocess.run([*command, "-o", str(tmp_path / f"{name}.o")], check=True)
 
 
+def test_a_hook_of_zeros_is_off(tmp_path: Path) -> None:
+    """A static one that no boot has initialised."""
+    hook, still = Hook(emitted(steady(), tmp_path), NAME, tmp_path / "b"), np.eye(13)[6]
+    vehicle = hook.boot()
+    ctypes.memset(hook.hooks[vehicle], 0, hook.c.size())
+    assert hook.run(vehicle, ned(still, 0), set_point(loop.REST, 0), 0)[0] == OFF
+    hook.start(vehicle, 0)
+    assert hook.run(vehicle, ned(still, 0), set_point(loop.REST, 0), 0)[0] == SELFTEST
+
+
 def test_time_outs_faults_and_hand_over(tmp_path: Path) -> None:
     hook, still = Hook(emitted(steady(), tmp_path), NAME, tmp_path / "b"), np.eye(13)[6]
     vehicle, now = hook.boot(), 2**32 - 2000
@@ -144,10 +156,11 @@ def test_time_outs_faults_and_hand_over(tmp_path: Path) -> None:
         (ATTITUDE_OLD, 20_000, "attitude_us"),
         (SETPOINT_OLD, 1_000_000, "received_us"),
     ):
-        for age, expected in ((old_us, FLIES), (old_us + 1, fault)):
+        ages = {old_us: FLIES, old_us + 1: fault, 2**31 + 10**6: fault, -10_000: FLIES, -10_001: fault}
+        for age, expected in ages.items():
             hook.start(vehicle, 9_000_000)
             estimate, to = ned(still, 9_000_000), set_point(loop.REST, 9_000_000)
-            setattr(estimate if hasattr(estimate, field) else to, field, 9_000_000 - age)
+            setattr(estimate if hasattr(estimate, field) else to, field, (9_000_000 - age) % 2**32)
             assert run(9_000_000, estimate, to) == expected
         assert run(9_010_000) == fault  # until the next start
     for index in (0, 4, 7, 11):

@@ -169,7 +169,8 @@ def test_the_header_says_where_each_motor_is_and_how_it_turns() -> None:
     lines = [line for line in header.splitlines() if "thrust" in line]
     for line, (x, y, spin) in zip(lines, [("+", "+", 1), ("-", "+", -1), ("-", "-", 1), ("+", "-", -1)], strict=True):
         assert f"x {x}0.07425 m, y {y}0.07425 m" in line
-        assert ("spin +1: reaction torque positive about body z" if spin > 0 else "spin -1: negative") in line
+        sense = "spin +1: reaction torque positive about body z, so it turns clockwise"
+        assert (sense if spin > 0 else "spin -1: counter-clockwise") in line
         assert "safe 1.636" in line
 
 

@@ -1,6 +1,6 @@
 """The errors of all flights over time, and how many of them have settled."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,7 +20,6 @@ LINES: tuple[dict[str, Any], ...] = (  # distinguishable without color
     {"color": COLORS[3], "linestyle": (0, (1, 1))},
     {"color": "black", "linestyle": (0, (5, 1.5, 1, 1.5))},
 )
-SHORT = 24  # characters of a name in the legend
 Others = Mapping[str, np.ndarray]  # name -> observations [n, K + 1, F] of another policy from the same starts
 
 
@@ -34,7 +33,10 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
     Axes: the spread of each error, and last the share that has settled; with the medians of the first few `others`.
     """
     found = measures.of_flights(task, observations)
-    compared = {name: measures.of_flights(task, other) for name, other in list(others.items())[: len(LINES)]}
+    shown = list(others)[: len(LINES)]
+    compared = {
+        label: measures.of_flights(task, others[name]) for name, label in zip(shown, _labels(shown), strict=True)
+    }
     names = [name for name in ERRORS if name in found.errors]
     rows = len(names) // 2 + 1
     figure = empty(task, height_in=2.0 + 2.0 * rows)
@@ -49,7 +51,7 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
         axes.plot(times, median, color=COLORS[0], linewidth=2, label="median flight")
         for (other, there), looks in zip(compared.items(), LINES, strict=False):
             line = np.clip(_ranks(there.errors[name])[1], *panel.limits)
-            axes.plot(times, line, linewidth=1.1, label=f"median of {_short(other)}", **looks)
+            axes.plot(times, line, linewidth=1.1, label=f"median of {other}", **looks)
     _settled(grid[len(names)], task, found, compared, observations.shape[1])
     for axes, title in zip(grid, (f"all {len(observations):,} flights", successes(found)), strict=False):
         finish(axes, title)
@@ -59,12 +61,16 @@ def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyTy
     return figure
 
 
-def _short(name: str) -> str:
-    """A path shortened to its last parts, which identify it."""
-    parts = name.split("/")
-    while len(parts) > 1 and len("/".join(parts)) > SHORT:
-        parts = parts[1:]
-    return name if len(name) <= SHORT else f"…/{'/'.join(parts)}"
+def _labels(names: Sequence[str]) -> list[str]:
+    """Of paths the last parts, as few as tell them apart."""
+
+    def end(name: str, count: int) -> str:
+        return "/".join(name.split("/")[-count:])
+
+    return [
+        next((end(name, n) for n in range(1, 20) if sum(end(other, n) == end(name, n) for other in names) == 1), name)
+        for name in names
+    ]
 
 
 def _ranks(errors: np.ndarray) -> np.ndarray:
@@ -82,4 +88,4 @@ def _settled(axes: Axes, task: Task, found: Measured, compared: dict[str, Measur
     over_time(axes, task, Panel("flights settled", "%", share(found.settle_s)[None], (0.0, 103.0)))
     axes.plot(times, share(found.settle_s), color=COLORS[0], linewidth=2)
     for (other, there), looks in zip(compared.items(), LINES, strict=False):
-        axes.plot(times, share(there.settle_s), linewidth=1.1, label=f"median of {_short(other)}", **looks)
+        axes.plot(times, share(there.settle_s), linewidth=1.1, label=f"median of {other}", **looks)

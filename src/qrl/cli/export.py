@@ -25,7 +25,7 @@ from qrl.export.firmware import betaflight, crazyflie, px4
 from qrl.export.kernel import Ints, Kernel
 from qrl.export.policy import Policy
 from qrl.export.quantize import UnsupportedNetwork, quantize, respond
-from qrl.export.report import FlightStats, Measured, gates, report
+from qrl.export.report import FlightStats, Measured, gates, report, warnings, with_warnings
 from qrl.export.verify import VerificationReport, verify
 from qrl_envs.specfile import BadInput
 
@@ -91,13 +91,15 @@ def export_run(
         folder = Path(scratch) / "export"
         emitted = emit.files(policy, kernel, vectors.golden(policy, kernel), name)
         _write(folder, emitted)
-        for adapter in ADAPTERS:
-            _write(folder, adapter.files(policy, emitted, name))
         (folder / f"{name}.onnx").write_bytes(portable.onnx_model(policy))
         (folder / f"{name}.npz").write_bytes(portable.arrays(policy))
         log("compiling and verifying; flying")
         verification = pool.submit(verify, policy, kernel, folder / f"{name}.c", vectors_per_entry)
         measured = _measured(run, policy, kernel, starts, verification.result)
+        for adapter in ADAPTERS:
+            for path, data in adapter.files(policy, emitted, name).items():
+                at_head = isinstance(data, str) and Path(path).name == "README.md"
+                _write(folder, {path: with_warnings(data, warnings(measured)) if at_head else data})
         sections = "".join(adapter.section(policy) for adapter in ADAPTERS)
         _write(folder, {"report.md": report(policy, kernel, measured, name) + sections})
         previous = Path(scratch) / "previous"

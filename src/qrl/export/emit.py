@@ -218,7 +218,11 @@ def _port_lines(policy: Policy, kernel: Kernel) -> Iterable[str]:
         yield f"{i:>3}  {o.name:<11} {o.unit:<7} {low:>9.4g} .. {high:<9.4g} {lsb:<10.4g} {o.frame}"
     yield ""
     yield f"act  {heading}"
-    turns = {None: "", 1: ", spin +1: reaction torque positive about body z", -1: ", spin -1: negative"}
+    turns = {
+        None: "",
+        1: ", spin +1: reaction torque positive about body z, so it turns clockwise seen from above",
+        -1: ", spin -1: counter-clockwise",
+    }
     for i, (a, (low, high), lsb) in enumerate(zip(policy.actions, _act_ranges(kernel), kernel.act_lsb, strict=True)):
         axes = ", ".join(f"{axis} {x:+g} m" for axis, x in zip("xyz", a.position_m or (), strict=False))
         place = axes and f"; motor at {axes} of the body"

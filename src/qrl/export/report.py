@@ -47,7 +47,7 @@ class Measured:
 
 
 def gates(measured: Measured) -> list[Gate]:
-    """Limits on the action error, and on how much worse the integer policy flies than the float policy."""
+    """Limits on the action error, on failures, and on how much worse the integer policy flies than the float one."""
     before, after = measured.float_flights, measured.integer_flights
     loss = (before.summary["return_mean"] - after.summary["return_mean"]) / abs(before.summary["return_mean"] or 1.0)
     found = [
@@ -58,6 +58,7 @@ def gates(measured: Measured) -> list[Gate]:
     ]
     if before.success is not None and after.success is not None:
         lost, gained = int(np.sum(before.success & ~after.success)), int(np.sum(after.success & ~before.success))
+        found.append(Gate("starts from which it fails", 100 * (1.0 - float(after.success.mean())), 5.0, "%"))
         found.append(Gate(f"successful starts lost (of {before.starts:,}; {gained} gained)", lost, 0))
     for name, value in before.summary.items():
         if name.startswith("rms_") and name.endswith("_m"):
@@ -67,12 +68,23 @@ def gates(measured: Measured) -> list[Gate]:
     return found
 
 
+def warnings(measured: Measured) -> list[str]:
+    """A line of Markdown for each gate that is not kept."""
+    return [f"> **Warning: failed: {gate}.**" for gate in gates(measured) if not gate.passed]
+
+
+def with_warnings(text: str, lines: list[str]) -> str:
+    """A page with lines below its title."""
+    title, rest = text.split("\n", 1)
+    return "\n".join([title, "", *lines, "> Find out why before it flies: report.md.", rest]) if lines else text
+
+
 def report(policy: Policy, kernel: Kernel, measured: Measured, name: str) -> str:
     found = gates(measured)
-    failed = [gate for gate in found if not gate.passed]
+    failed = warnings(measured)
     run = policy.provenance
     lines = [f"# {run.task}: {'-'.join(map(str, kernel.widths))} {kernel.activation}, int8", ""]
-    lines += [f"> **Warning: failed: {gate}.**" for gate in failed]
+    lines += failed
     if failed:
         lines += ["> The C matches the integer reference; the integer policy differs this much from the float one.", ""]
     lines += [
@@ -170,5 +182,6 @@ Add `{name}.h` and `{name}.c` to the firmware: C99, no libm, no heap, no static 
   whenever the policy takes up control again.
 - All names begin with `{name}`: any number of exports of different names link into one firmware.
 - `{name}.onnx`: the float policy, for runtimes of ONNX. `{name}.npz`: its numbers, for NumPy.
-- `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with.
+- `manifest.json`: the same facts, machine-readable. `golden.csv`: inputs and outputs to test a port with,
+  with memory of one sequence from a reset.
 """

@@ -194,7 +194,9 @@ def facts(policy: Policy) -> list[str]:
     found = vehicle.facts(policy)
     build = platform(policy)
     if build is None:
-        found.append("It orders rotor speeds and was trained on many vehicles: it flies each Crazyflie.")
+        found.append(
+            "It orders rotor speeds and was trained on many vehicles: it is for each of docs/crazyflie.md's platforms."
+        )
     else:
         limit_N = max(port.high for port in policy.actions)
         found.append(

@@ -21,6 +21,11 @@ static bool all_finite(const float *numbers, const int count) {
     return true;
 }
 
+/* Whether a time is further back than `most_us`. It may be a little ahead of now, where an interrupt stamps it. */
+static bool old(const uint32_t now_us, const uint32_t then_us, const uint32_t most_us) {
+    return now_us - then_us + @NAME@_AHEAD_US > most_us + @NAME@_AHEAD_US;
+}
+
 /* Whether an estimate and a set-point are numbers, and the quaternion is one. */
 static bool usable(const @name@_estimate *estimate, const @name@_setpoint *setpoint) {
     const float *q = estimate->attitude;
@@ -106,23 +111,19 @@ void @name@_hook_stop(@name@_hook *hook) {
 
 int @name@_hook_check(const @name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint,
                       const uint32_t now_us) {
-    /* A time may be a little ahead of now, where an interrupt stamps it: its age is then 0. */
-    const int32_t position_age = (int32_t)(now_us - estimate->position_us);
-    const int32_t attitude_age = (int32_t)(now_us - estimate->attitude_us);
-    const int32_t setpoint_age = (int32_t)(now_us - setpoint->received_us);
     if (!hook->tested) {
         return @NAME@_SELFTEST;
     }
     if (!usable(estimate, setpoint)) {
         return @NAME@_NOT_FINITE;
     }
-    if (position_age > @NAME@_POSITION_US) {
+    if (old(now_us, estimate->position_us, @NAME@_POSITION_US)) {
         return @NAME@_POSITION_OLD;
     }
-    if (attitude_age > @NAME@_ATTITUDE_US) {
+    if (old(now_us, estimate->attitude_us, @NAME@_ATTITUDE_US)) {
         return @NAME@_ATTITUDE_OLD;
     }
-    return setpoint_age > @NAME@_SETPOINT_US ? @NAME@_SETPOINT_OLD : @NAME@_FLIES;
+    return old(now_us, setpoint->received_us, @NAME@_SETPOINT_US) ? @NAME@_SETPOINT_OLD : @NAME@_FLIES;
 }
 
 int @name@_hook_run(@name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint,

@@ -35,10 +35,15 @@ extern "C" {
 #define @NAME@_EARLY_US 500
 #endif
 
-/* What @name@_hook_run returns. */
+/* A time that is ahead of now by more than this is not of now: its age is taken as too great [us]. */
+#ifndef @NAME@_AHEAD_US
+#define @NAME@_AHEAD_US 10000
+#endif
+
+/* What @name@_hook_run returns. A hook of zeros, which no @name@_hook_init has seen, is off. */
 enum {
-    @NAME@_FLIES = 0,
-    @NAME@_OFF = 1, /* not handed over, or given back by @name@_hook_stop */
+    @NAME@_OFF = 0, /* not handed over, or given back by @name@_hook_stop */
+    @NAME@_FLIES = 1,
     /* Faults: until the next @name@_hook_start. */
     @NAME@_POSITION_OLD = 2,
     @NAME@_ATTITUDE_OLD = 3,
@@ -90,7 +95,8 @@ int @name@_hook_check(const @name@_hook *hook, const @name@_estimate *estimate, 
                       uint32_t now_us);
 
 /* One loop of the motors. Returns who flies; only with @NAME@_FLIES are commands written to motor: @command@.
- * Order: @order@. Times may wrap around. */
+ * Order: @order@. Times may wrap around, every 71 minutes: one that never changes is fresh again for a moment then, so do not
+ * hand over before each quantity was measured. */
 int @name@_hook_run(@name@_hook *hook, const @name@_estimate *estimate, const @name@_setpoint *setpoint, uint32_t now_us,
                     float motor[4]);
 

@@ -18,11 +18,12 @@ void setup() {
 void loop() {
   if ((long)(micros() - next_us) < 0) return;
   next_us += @NAME@_PERIOD_US;
+  if ((long)(micros() - next_us) >= 0) next_us = micros() + @NAME@_PERIOD_US;  // late: what was missed is not caught up
 
   // Yours: fill obs from the state estimate, in the order, units and frames of @name@.h.
   const int status = @name@_step(&state, obs, act);
   if (status == 2) {
-    // An input is not finite: act holds the safe action; hand over to a fallback controller.
+    return;  // An input is not finite: hand over to a fallback controller, yours. act is for one vehicle, level and at rest.
   }
   // Yours: act to motor commands.
 }

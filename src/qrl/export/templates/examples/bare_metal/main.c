@@ -28,10 +28,12 @@ int main(void) {
     float obs[@NAME@_OBS_SIZE], act[@NAME@_ACT_SIZE];
     read_sensors(obs);
     const int status = @name@_step(&state, obs, act);
-    if (status == 2) {
-        printf("an input is not finite: act holds the safe action; hand over to a fallback controller\n");
-    } else if (status == 1) {
-        printf("an input is beyond its calibrated range\n");
+    if (status == 2) { /* act holds the safe action, which is for one vehicle, level and at rest */
+        printf("an input is not finite: hand over to a fallback controller\n");
+        return 2;
+    }
+    if (status == 1) {
+        printf("an input is beyond its calibrated range, and was clipped to it\n");
     }
     drive(act);
     return 0;
