@@ -263,6 +263,11 @@ def _registration(module: Module) -> Iterator[str]:
     vehicle.tick(BEGIN_US + 1_700_000, row, mode=0)
     if not c.configured():
         yield "PX4's controllers stay on"
+    other = _on(module)
+    other.tick(BEGIN_US + 2_000_000, row, mode=0, check=2)
+    orders = other.tick(BEGIN_US + 2_010_000, row).published
+    if orders or not c.asked():
+        yield "a mode that the commander has removed gives orders, or is not asked for again"
     if not c.stopped(vehicle.pointer):
         yield "a stop leaves the mode registered"
     c.in_place_of_offboard(1)
@@ -298,14 +303,17 @@ def _orders(module: Module) -> Iterator[str]:
 
 def _ages(module: Module) -> Iterator[str]:
     late, row = 40_000_000_000, _still()  # [us] after boot: twice as long as a difference in 32 bits can say
-    for stale in ({"position": 0}, {"position": 2}, {"attitude": 0}):
+    for stale in ({"position": 0}, {"position": 2}, {"position": 3}, {"attitude": 0}):
         for begin_us in (BEGIN_US, late):
             if _on(module).tick(begin_us, row, mode=0, check=1, **stale).able:
                 yield f"it may be armed without {stale}"
         vehicle, most_us = _on(module), 50_000 if "attitude" in stale else 100_000
         flew = [vehicle.tick(BEGIN_US + 2500 * i, row, check=1).published for i in range(8)]
         out = [vehicle.tick(BEGIN_US + 17_500 + 2500 * i, row, check=1, **stale) for i in range(1, 60)]
-        ordered_us = 2500 * max((i for i, each in enumerate(out, 1) if each.published), default=0)
+        *ordered, last = [(2500 * i, each) for i, each in enumerate(out, 1) if each.published] or [(0, out[0])]
+        ordered_us = ordered[-1][0] if ordered else 0
+        if last[0] != most_us + 2500 or np.ptp(last[1].motor):
+            yield f"with {stale} a torque is left on the motors"
         able_us = 2500 * max((i for i, each in enumerate(out, 1) if each.able), default=0)
         if not any(flew) or not most_us - 10_000 <= ordered_us <= most_us or able_us != most_us:
             yield f"with {stale} orders end after {ordered_us} us, the arming check's yes after {able_us} us"
@@ -328,7 +336,7 @@ def _ages(module: Module) -> Iterator[str]:
         if not vehicle.tick(BEGIN_US, row).published or not vehicle.tick(BEGIN_US + 10_000, row).published:
             yield "no orders"
         out = vehicle.tick(BEGIN_US + 20_000, bad, check=1)
-        if out.published or out.able:
+        if (out.published and np.ptp(out.motor)) or out.able:
             yield f"orders of number {index} that is not one"
         vehicle.tick(BEGIN_US + 30_000, row, mode=0)
         if not vehicle.tick(BEGIN_US + 40_000, row, mode=0, check=1).able:
@@ -415,8 +423,10 @@ def mistakes(name: str) -> dict[str, list[Mutant]]:
         "motors in the Crazyflie's order": [(motor, "i < 4 ? motor[i == 1 ? 3 : i == 3 ? 2 : i == 2 ? 1 : 0]")],
         "commands halved": [(motor, "i < 4 ? 0.5f * motor[i]")],
         "other motors at 0": [(": NAN", ": 0.0f")],
-        "ages ignored": [("now_us > then_us ? now_us - then_us : 0", "0 * then_us")],
-        "ages wrap around": [("(age_us < INT32_MAX ? static_cast<uint32_t>(age_us) : INT32_MAX)", "(uint32_t)age_us")],
+        "ages ignored": [("ahead ? then_us - now_us : now_us - then_us", "0 * then_us")],
+        "ages wrap around": [
+            ("apart_us < INT32_MAX ? static_cast<uint32_t>(apart_us) : INT32_MAX", "(uint32_t)apart_us")
+        ],
         "validity ignored": [("position.xy_valid && position.z_valid", "true || position.z_valid")],
         "time of the last position ignored": [("_position_us = position.timestamp", "_position_us = UINT64_MAX")],
         "memory not reset": [(f"{name}_reset(&hook->memory);", "")],
@@ -426,7 +436,7 @@ def mistakes(name: str) -> dict[str, list[Mutant]]:
         "arming check always granted": [(able, "able >= 0")],
         "arming check forgets a fault": [(f"{able} && (!_on || _who == {name.upper()}_FLIES)", able)],
         "fault stays with the set-point": [("_setpoint = {}; // one", "// one")],
-        "set-point does not age": [("now_us - _asked_us > SETPOINT_US", "false")],
+        "set-point does not age": [(f"now_us > _asked_us + {name.upper()}_SETPOINT_US", "false")],
         "holds the place of each sample": [("_asked = false;", "_asked = true;")],
         "holds no place at the take-over": [("hold(); // a set-point", "// a set-point")],
         "holds the heading north": [("_setpoint.yaw_rad = atan2f", "_setpoint.yaw_rad = 0.0f * atan2f")],
@@ -440,13 +450,17 @@ def mistakes(name: str) -> dict[str, list[Mutant]]:
         ],
         "another's registration": [("reply.request_id == REQUEST_ID && ", "")],
         "a registration refused": [(" && reply.success", "")],
-        "asks once": [("now_us - _requested_us > REQUEST_US", "false")],
+        "asks once": [("now_us > _requested_us + REQUEST_US", "false")],
         "control allocation left on": [
             ("config.source_id", "config.flag_control_allocation_enabled = true; config.source_id")
         ],
         "arming check of another": [("= request.request_id", "= 0")],
         "not unregistered": [("request.mode_id = _mode_id;", "")],
         "never in place of Offboard": [("_param_offboard.get()", "false")],
+        "a removed mode stays": [("!(request.valid_registrations_mask & (1u << _arming_check_id))", "false")],
+        "may be armed in this mode": [("mode_req_prevent_arming = true", "mode_req_prevent_arming = false")],
+        "dead reckoning taken for a position": [(" && !position.dead_reckoning", "")],
+        "torque left at a fault": [(f"_who == {name.upper()}_FLIES && _on)", "_who < 0)")],
         "no MAVLink set-points": [("request_offboard_setpoints = true", "request_offboard_setpoints = false")],
     }
     return {what: [Mutant(*change) for change in changes] for what, changes in found.items()}

@@ -49,8 +49,8 @@ void registered(int granted, int own)
 
 /*
  * One IMU sample at `us`. in [27]: local position x y z and velocity (NED), attitude w x y z (FRD to NED), body rates (FRD), set-point
- * x y z, velocity, yaw, yaw rate, acceleration, jerk (NED). flags [6]: whether position (2: not valid), attitude and set-point are new,
- * the mode is on, the vehicle armed, the arming check asked.
+ * x y z, velocity, yaw, yaw rate, acceleration, jerk (NED). flags [6]: whether position (2: not valid, 3: dead reckoning), attitude and set-point are new,
+ * the mode is on, the vehicle armed, the arming check asked (2: of others, the module is no longer registered).
  * out [7]: actuator_motors 1 to 4, and whether they were published; the answer to the arming check (−1: none); whether the other motors
  * are stopped, none is reversible and the times are told.
  */
@@ -59,7 +59,8 @@ void tick(void *vehicle, uint64_t us, const float *in, const int *flags, float *
     shim::now_us = us + 150; // the work queue runs later
     vehicle_local_position_s position{};
     position.timestamp = us;
-    position.xy_valid = position.z_valid = position.v_xy_valid = position.v_z_valid = flags[0] == 1;
+    position.xy_valid = position.z_valid = position.v_xy_valid = position.v_z_valid = flags[0] == 1 || flags[0] == 3;
+    position.dead_reckoning = flags[0] == 3;
     position.x = in[0];
     position.y = in[1];
     position.z = in[2];
@@ -94,6 +95,7 @@ void tick(void *vehicle, uint64_t us, const float *in, const int *flags, float *
 
     arming_check_request_s request{};
     request.request_id = ASKED;
+    request.valid_registrations_mask = flags[5] == 2 ? 0 : 1u << ARMING_CHECK_ID;
     shim::topic<arming_check_request_s> = {request, flags[5] != 0};
     shim::topic<arming_check_reply_s>.fresh = shim::topic<actuator_motors_s>.fresh = false;
     shim::topic<register_ext_component_request_s>.fresh = shim::topic<vehicle_control_mode_s>.fresh = false;
@@ -109,7 +111,7 @@ void tick(void *vehicle, uint64_t us, const float *in, const int *flags, float *
     }
     out[4] = shim::topic<actuator_motors_s>.fresh;
     const bool ours = reply.request_id == ASKED && reply.registration_id == ARMING_CHECK_ID && reply.mode_req_local_position &&
-        reply.mode_req_attitude && reply.mode_req_angular_velocity && reply.mode_req_local_alt && !reply.mode_req_manual_control;
+        reply.mode_req_attitude && reply.mode_req_prevent_arming && reply.mode_req_angular_velocity && reply.mode_req_local_alt && !reply.mode_req_manual_control;
     out[5] = !shim::topic<arming_check_reply_s>.fresh ? -1.0f : ours && reply.can_arm_and_run ? 1.0f : 0.0f;
     out[6] = others;
 }

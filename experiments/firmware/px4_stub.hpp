@@ -40,7 +40,7 @@ static hrt_abstime hrt_absolute_time() { return shim::now_us; }
 #ifdef PX4_TOPICS
 #include PX4_TOPICS
 #else
-struct vehicle_local_position_s { uint64_t timestamp; bool xy_valid, z_valid, v_xy_valid, v_z_valid; float x, y, z, vx, vy, vz; };
+struct vehicle_local_position_s { uint64_t timestamp; bool xy_valid, z_valid, v_xy_valid, v_z_valid, dead_reckoning; float x, y, z, vx, vy, vz; };
 struct vehicle_attitude_s { uint64_t timestamp; float q[4]; };
 struct vehicle_angular_velocity_s { uint64_t timestamp_sample; float xyz[3]; };
 struct trajectory_setpoint_s { float position[3], velocity[3], acceleration[3], jerk[3], yaw, yawspeed; };
@@ -71,7 +71,7 @@ struct vehicle_control_mode_s {
         flag_control_position_enabled, flag_control_climb_rate_enabled, flag_control_allocation_enabled,
         flag_control_termination_enabled;
 };
-struct arming_check_request_s { uint64_t timestamp; uint8_t request_id; };
+struct arming_check_request_s { uint64_t timestamp; uint8_t request_id; uint32_t valid_registrations_mask; };
 struct arming_check_reply_s {
     static constexpr uint8_t HEALTH_COMPONENT_INDEX_NONE = 0;
     uint64_t timestamp;

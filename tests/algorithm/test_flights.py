@@ -1,5 +1,8 @@
 """Deterministic flights: against a literal loop, and that nothing is gained by ending."""
 
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +10,7 @@ import pytest
 from brax.envs.base import Env, State
 
 from qrl.algorithm import flights
+from qrl.evaluation.host_flights import HostFlights
 from qrl_envs import env as worlds
 from qrl_envs.controllers import geometric
 
@@ -57,6 +61,35 @@ def test_flights_are_those_of_a_literal_loop(constant: float) -> None:
         assert found.complete[i] == (not np.isnan(seen[-1]))
     assert set(ended) == {"", "out", "terminated"}
     assert not found.measures
+
+
+class Marked(Drifting):
+    """With a start of its own for calibration."""
+
+    def reset_calibration(self, rng: jax.Array) -> State:
+        return self._at(0.01 * jax.random.uniform(rng, (1,)) + 0.5)
+
+
+def test_flights_of_the_host_are_those_of_one_program() -> None:
+    """With a memory; the last of them start in the envelope."""
+    env, keys = Marked(2.0), jax.random.split(jax.random.PRNGKey(0), 12)
+
+    def policy(xp: Any, memory: Any, o: Any) -> tuple[Any, Any]:
+        return 0.5 * memory + o, xp.clip(-0.5 * memory, -2.0, 2.0)
+
+    def reset(env: Any, keys: jax.Array) -> State:
+        states = jax.vmap(env.reset_calibration)(keys), jax.vmap(env.reset)(keys)
+        last = (jnp.arange(12) >= 9).reshape(12, 1)
+        return jax.tree.map(lambda a, b: jnp.where(last if a.ndim == 2 else last[:, 0], a, b), *states)
+
+    wanted = jax.jit(
+        lambda keys: flights.fly_with_memory(env, partial(policy, jnp), jnp.ones((12, 1)), keys, STEPS, reset)
+    )(keys)
+    found = HostFlights(env, STEPS).fly(partial(policy, np), np.ones((12, 1)), keys, from_envelope=0.25)
+    assert not wanted.complete.all()
+    assert np.ptp(np.asarray(wanted.observations)[9:, 0]) < 0.02
+    for name in ("returns", "complete", "observations", "actions"):
+        np.testing.assert_allclose(getattr(found, name), getattr(wanted, name), rtol=1e-5, err_msg=name)
 
 
 @pytest.mark.parametrize("task", ["hover", "circle"])

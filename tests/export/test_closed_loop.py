@@ -10,6 +10,7 @@ import pytest
 from brax.envs.base import State
 
 from qrl.evaluation import calibration
+from qrl.evaluation.starts import calibration_starts
 from qrl.evaluation.trained_run import TrainedRun, flown_inputs, inputs_in_si
 from qrl.export import kernel as reference
 from qrl.export.policy import ActionSpec, Integral, Memory, ObservationSpec, Policy, Provenance
@@ -118,6 +119,37 @@ def test_the_integer_policy_flies_with_its_own_memory(run: TrainedRun, monkeypat
     assert (
         np.abs(np.asarray(flown[1].observations)[:, -1, 9:12]).min() > 0.1
     )  # the integral that holds against the push
+
+
+class Misled(Pushed):
+    """Its measurements are 0.25 m and m/s off the truth, which is recorded; a flight ends 0.3 m from the origin."""
+
+    def _state(self, world: World) -> State:
+        state = super()._state(world)
+        obs = state.obs + 0.25 * (jnp.arange(14) < 6)
+        done = (jnp.linalg.norm(world.p) < 0.3).astype(jnp.float32)
+        return State(state.pipeline_state, obs, state.reward, done, {}, {"true_obs": state.obs})
+
+
+def test_calibration_is_on_what_the_policy_was_given(run: TrainedRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not on the truth beside it, and not on what comes after a flight's end."""
+    monkeypatch.setattr(calibration, "STARTS", STARTS)
+    monkeypatch.setattr(calibration, "select", lambda observations: observations)
+    monkeypatch.setattr(run, "env", Misled())
+    monkeypatch.setattr(run, "_on_host", {})
+    policy, given = run.float_policy(), []
+
+    def step(memory: None, observation: np.ndarray) -> tuple[None, np.ndarray]:
+        given.append(inputs_in_si(policy, observation))
+        return memory, policy(given[-1])
+
+    flights = run.fly_host_policy(step, None, calibration_starts(STARTS), from_envelope=0.2, calibrating=True)
+    ended = np.isnan(flights.observations[:, :-1, 0])
+    assert 0 < ended.all(axis=1).sum() + ended.any(axis=1).sum() < 2 * STARTS
+    found = run.policy().calibration
+    np.testing.assert_allclose(found[~ended], np.stack(given, axis=1)[~ended], rtol=1e-5)
+    np.testing.assert_allclose(found[~ended][:, :6] - 0.25, flights.observations[:, :-1, :6][~ended], atol=1e-5)
+    assert np.isnan(found[ended]).all()
 
 
 def test_the_inputs_of_a_flight_are_those_that_the_environment_gave(run: TrainedRun) -> None:

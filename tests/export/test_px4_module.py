@@ -7,6 +7,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -54,7 +55,14 @@ REASONS = {
     **{case: UNFIT[case] for case in ("pendulum", "six motors", "unit")},
     "a corner": (UNFIT["a corner"][0], r"there is one motor front right \(1\), and the vehicle has 2"),
     "a spin": (lambda: changed(recurrent(), 1, spin=-1), r"back right \(4\) has spin \+1, and the vehicle's \(f2\) -1"),
+    "a circle": (lambda: around_a_circle(recurrent()), "the center of a circle that it flies"),
 }
+
+
+def around_a_circle(policy: Policy) -> Policy:
+    ports = list(policy.observations)
+    ports[9] = replace(ports[9], frame="world: position from the circle's center")
+    return replace(policy, observations=tuple(ports))
 
 
 @pytest.mark.parametrize("case", REASONS)
@@ -87,15 +95,19 @@ def test_each_policy_gets_what_it_fits() -> None:
     assert px4.checkpoint_refusal(of_vehicle("x500"))
 
 
-def test_names_are_as_long_as_px4_takes() -> None:
-    name = "qrl_a_policy_of_a_very_long_name"
-    files = px4.files(recurrent(), {f"{name}.c": "", f"{name}.h": ""}, name)
-    parameter = re.search(r"^        (\w+):$", str(files[f"px4/module/src/modules/{name}/module.yaml"]), re.MULTILINE)
-    mode = re.search(r'strncpy\(request.name, "(\w+)"', str(files[f"px4/module/src/modules/{name}/{name}_mode.cpp"]))
-    assert parameter
-    assert mode
-    assert (parameter[1], mode[1]) == ("QRL_A_POLIC_OFFB", "qrl_a_policy_of_a_very_l")
-    assert f"px4::params::{parameter[1]}>" in str(files[f"px4/module/src/modules/{name}/{name}_mode.hpp"])
+def test_names_are_as_long_as_px4_takes_and_differ() -> None:
+    found = set[str]()
+    for name in ("qrl_a_policy_of_a_very_long_name", "qrl_a_policy_of_a_very_long_name_too"):
+        files = px4.files(recurrent(), {f"{name}.c": "", f"{name}.h": ""}, name)
+        source = f"px4/module/src/modules/{name}"
+        parameter = re.search(r"^        (\w+):$", str(files[f"{source}/module.yaml"]), re.MULTILINE)
+        mode = re.search(r'strncpy\(request.name, "(\w+)"', str(files[f"{source}/{name}_mode.cpp"]))
+        assert parameter
+        assert mode
+        assert (len(parameter[1]), len(mode[1])) == (16, 24)
+        found |= {parameter[1], mode[1]}
+    assert len(found) == 4
+    assert f"px4::params::{parameter[1]}>" in str(files[f"{source}/{name}_mode.hpp"])
 
 
 def test_it_compiles_for_a_flight_controller(tmp_path: Path) -> None:

@@ -134,13 +134,13 @@ class TrainedRun:
 
         def step(h: NDArray[np.floating], observation: NDArray[np.float32]) -> tuple[Any, NDArray[np.floating]]:
             inputs = np.concatenate([inputs_in_si(policy, observation), h], axis=-1)  # the environment keeps the rest
-            flown.append(inputs)
+            flown.append(inputs.astype(np.float32))
             return policy.respond(inputs)
 
         starts = calibration_starts(calibration.STARTS)
         h = np.zeros((len(starts), policy.memory.units if policy.memory else 0))
         flights = self.fly_host_policy(step, h, starts, from_envelope=calibration.FROM_ENVELOPE, calibrating=True)
-        inputs = np.stack(flown, axis=1, dtype=np.float32)
+        inputs = np.stack(flown, axis=1)
         ended = np.isnan(np.asarray(flights.observations)[:, :-1]).any(axis=-1, keepdims=True)
         return replace(policy, calibration=calibration.select(np.where(ended, np.nan, inputs)))
 
@@ -265,7 +265,7 @@ def inputs_in_si(policy: Policy, observation: NDArray[np.floating]) -> NDArray[n
 def flown_inputs(policy: Policy, flights: Flights) -> NDArray[np.float32]:
     """The policy's inputs [n, steps, I] in SI units at each step of its flights, NaN from where one ended early.
 
-    A flight's observations are the measured ones; what the policy remembered follows from them and the actions.
+    Made of the actions and of what was recorded, the truth: with noisy sensors not what the policy was given.
     """
     measured = np.asarray(flights.observations)[:, :-1, : len(policy.observations)]
     parts = [measured]

@@ -116,7 +116,7 @@ def _verification(kernel: Kernel, verification: VerificationReport) -> Iterable[
         if verification.steps:
             yield (
                 "- The same for the state after each, in sequences; and on smooth sequences of {:,} steps on the host,"
-                " {:,} on a core.".format(*verification.steps)
+                " {:,} on a core (where it has a tenth of the inputs, a tenth).".format(*verification.steps)
             )
     yield from (f"- Skipped {line}." for line in verification.skipped)
     yield ""

@@ -52,6 +52,8 @@ def refusal(policy: Policy) -> str | None:
     """Why there is no module for a policy, in one line; None if there is."""
     if reason := vehicle.misfit(policy):
         return reason
+    if "circle" in policy.observations[9].frame:
+        return "its set-point is the center of a circle that it flies, and the mode holds places"
     order = vehicle.by_place_and_spin(policy, QUAD_X)
     return f"of PX4's quadrotor X, {order}" if isinstance(order, str) else None
 
@@ -194,8 +196,8 @@ def _module(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]
         "name": name,
         "NAME": name.upper(),
         "class": "".join(part.capitalize() for part in name.split("_")) + "Mode",
-        "mode": name[:MOST_MODE],
-        "parameter": f"{name.upper()[: MOST_PARAMETER - len(OFFBOARD)]}{OFFBOARD}",
+        "mode": _cut(name, MOST_MODE),
+        "parameter": _cut(name, MOST_PARAMETER - len(OFFBOARD)).upper() + OFFBOARD,
         "request_id": str(zlib.crc32(name.encode())),
         "description": " ".join(policy.provenance.description.split()),
         "command": ned.COMMAND,
@@ -211,6 +213,11 @@ def _module(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]
 
 
 OFFBOARD = "_OFFB"
+
+
+def _cut(name: str, most: int) -> str:
+    """A name of at most so many characters; of a longer one the end is of its hash, so that two differ."""
+    return name if len(name) <= most else f"{name[: most - 4]}{zlib.crc32(name.encode()) & 0xFFFF:04x}"
 
 
 def said(policy: Policy, where: str = "") -> tuple[str, str]:

@@ -51,7 +51,7 @@ void @class@::registration(const hrt_abstime now_us)
 	}
 
 	// The commander may start later, and refuses while the vehicle is armed.
-	if (_mode_id < 0 && (_requested_us == 0 || now_us - _requested_us > REQUEST_US)) {
+	if (_mode_id < 0 && (_requested_us == 0 || now_us > _requested_us + REQUEST_US)) {
 		register_ext_component_request_s request{};
 		request.timestamp = hrt_absolute_time();
 		request.request_id = REQUEST_ID;
@@ -95,6 +95,12 @@ void @class@::reply_to_arming_check(const hrt_abstime now_us)
 		return;
 	}
 
+	if (!(request.valid_registrations_mask & (1u << _arming_check_id))) { // the commander has removed it: to be asked for anew
+		_mode_id = _arming_check_id = -1;
+		_on = false;
+		return;
+	}
+
 	const int able = @name@_hook_check(&_hook, &_estimate, &_setpoint, static_cast<uint32_t>(now_us));
 	arming_check_reply_s reply{};
 	reply.timestamp = hrt_absolute_time();
@@ -103,6 +109,7 @@ void @class@::reply_to_arming_check(const hrt_abstime now_us)
 	reply.health_component_index = arming_check_reply_s::HEALTH_COMPONENT_INDEX_NONE;
 	// A fault in flight stays one until the mode is left, so that the commander learns of it and takes another mode.
 	reply.can_arm_and_run = able == @NAME@_FLIES && (!_on || _who == @NAME@_FLIES);
+	reply.mode_req_prevent_arming = true; // PX4 does not see a landing without its own controllers' orders
 	reply.mode_req_angular_velocity = true;
 	reply.mode_req_attitude = true;
 	reply.mode_req_local_alt = true;
@@ -110,11 +117,13 @@ void @class@::reply_to_arming_check(const hrt_abstime now_us)
 	_arming_check_reply_pub.publish(reply);
 }
 
-// Of a time in 64 bits, one in 32 for the hook: what is older than it can say stays old.
+// Of a time in 64 bits, one in 32 for the hook: what is further from now than it can say stays far.
 static uint32_t stamp(const hrt_abstime then_us, const hrt_abstime now_us)
 {
-	const hrt_abstime age_us = now_us > then_us ? now_us - then_us : 0;
-	return static_cast<uint32_t>(now_us) - (age_us < INT32_MAX ? static_cast<uint32_t>(age_us) : INT32_MAX);
+	const bool ahead = then_us > now_us;
+	const hrt_abstime apart_us = ahead ? then_us - now_us : now_us - then_us;
+	const uint32_t most_us = apart_us < INT32_MAX ? static_cast<uint32_t>(apart_us) : INT32_MAX;
+	return static_cast<uint32_t>(now_us) + (ahead ? most_us : 0u - most_us);
 }
 
 void @class@::estimate(const vehicle_angular_velocity_s &rates, const hrt_abstime now_us)
@@ -128,7 +137,7 @@ void @class@::estimate(const vehicle_angular_velocity_s &rates, const hrt_abstim
 	}
 
 	if (_vehicle_local_position_sub.update(&position) && position.xy_valid && position.z_valid && position.v_xy_valid
-	    && position.v_z_valid) {
+	    && position.v_z_valid && !position.dead_reckoning) {
 		_estimate.position_m[0] = position.x;
 		_estimate.position_m[1] = position.y;
 		_estimate.position_m[2] = position.z;
@@ -239,7 +248,7 @@ void @class@::Run()
 		follow(asked, now_us);
 	}
 
-	if (_on && _asked && now_us - _asked_us > SETPOINT_US) {
+	if (_on && _asked && now_us > _asked_us + @NAME@_SETPOINT_US) {
 		hold();
 	}
 
@@ -253,6 +262,12 @@ void @class@::Run()
 		publish(motor, now_us);
 		_steps += 1;
 		_clipped += _hook.status == 1;
+	}
+
+	if (who != @NAME@_FLIES && _who == @NAME@_FLIES && _on) { // a fault: no torque until PX4 takes another mode
+		const float mean = 0.25f * (_hook.motor[0] + _hook.motor[1] + _hook.motor[2] + _hook.motor[3]);
+		const float level[4] = {mean, mean, mean, mean};
+		publish(level, now_us);
 	}
 
 	tell(who);

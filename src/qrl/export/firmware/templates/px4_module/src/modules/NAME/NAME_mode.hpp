@@ -53,7 +53,6 @@ public:
 private:
 	static constexpr uint64_t REQUEST_ID = @request_id@; // of the registration; of the module's name
 	static constexpr hrt_abstime REQUEST_US = 1000000; // between requests, until one is granted
-	static constexpr hrt_abstime SETPOINT_US = 200000; // age of a set-point above which the place is held
 
 	void Run() override;
 
