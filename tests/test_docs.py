@@ -154,7 +154,7 @@ def test_the_readme_states_measured_times() -> None:
 def test_the_gallery_is_of_the_presets_that_ship_or_says_so() -> None:
     """Each preset's run has as many steps as its preset, or a note at the head says that the page is older."""
     page = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
-    runs = re.findall(r"`qrl train (\w+) --seeds 1(?: --preset (\w+))?`,\s([\d,]+) steps", page)
+    runs = re.findall(r"`qrl train (\w+) --seed \d+ --seeds 1(?: --preset (\w+))?`,\s([\d,]+) steps", page)
     assert sorted(preset or task for task, preset, _ in runs) == sorted(
         [f"{task}{suffix}" for task in ("pendulum", "hover", "circle") for suffix in ("", "_ppo")]
     )
