@@ -454,6 +454,7 @@ def mistakes(name: str) -> dict[str, list[Mutant]]:
         "control allocation left on": [
             ("config.source_id", "config.flag_control_allocation_enabled = true; config.source_id")
         ],
+        "body rates left to PX4": [("config.source_id", "config.flag_control_rates_enabled = true; config.source_id")],
         "arming check of another": [("= request.request_id", "= 0")],
         "not unregistered": [("request.mode_id = _mode_id;", "")],
         "never in place of Offboard": [("_param_offboard.get()", "false")],

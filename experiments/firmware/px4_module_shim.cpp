@@ -128,8 +128,10 @@ int configured()
 {
     const vehicle_control_mode_s &of = shim::topic<vehicle_control_mode_s>.message;
     return shim::topic<vehicle_control_mode_s>.fresh && of.source_id == MODE_ID && !of.flag_multicopter_position_control_enabled &&
-        !of.flag_control_manual_enabled && !of.flag_control_position_enabled && !of.flag_control_climb_rate_enabled &&
-        !of.flag_control_allocation_enabled;
+        !of.flag_control_manual_enabled && !of.flag_control_offboard_enabled && !of.flag_control_position_enabled &&
+        !of.flag_control_velocity_enabled && !of.flag_control_altitude_enabled && !of.flag_control_climb_rate_enabled &&
+        !of.flag_control_acceleration_enabled && !of.flag_control_attitude_enabled && !of.flag_control_rates_enabled &&
+        !of.flag_control_allocation_enabled && !of.flag_control_termination_enabled;
 }
 const char *name() { return shim::topic<register_ext_component_request_s>.message.name; }
 void in_place_of_offboard(int on) { shim::offboard = on; }

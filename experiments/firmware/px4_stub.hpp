@@ -68,7 +68,8 @@ struct vehicle_control_mode_s {
     uint64_t timestamp;
     uint8_t source_id;
     bool flag_multicopter_position_control_enabled, flag_control_manual_enabled, flag_control_offboard_enabled,
-        flag_control_position_enabled, flag_control_climb_rate_enabled, flag_control_allocation_enabled,
+        flag_control_position_enabled, flag_control_velocity_enabled, flag_control_altitude_enabled, flag_control_climb_rate_enabled,
+        flag_control_acceleration_enabled, flag_control_attitude_enabled, flag_control_rates_enabled, flag_control_allocation_enabled,
         flag_control_termination_enabled;
 };
 struct arming_check_request_s { uint64_t timestamp; uint8_t request_id; uint32_t valid_registrations_mask; };
