@@ -67,8 +67,8 @@ def build(app: Path, firmware: Firmware, out: Path, *mutants: Mutant) -> Path:
     includes = [f"-I{folder}" for folder in (source.parent, *firmware.includes)]
     common = ("gcc", "-std=gnu11", "-fPIC", *firmware.flags, *includes)
     if not mutants:
-        _run(*common, "-O2", *STRICT, "-c", str(source), "-o", str(out.with_name("app.o")))
-        _run(
+        run(*common, "-O2", *STRICT, "-c", str(source), "-o", str(out.with_name("app.o")))
+        run(
             *common,
             "-O2",
             *STRICT,
@@ -78,13 +78,14 @@ def build(app: Path, firmware: Firmware, out: Path, *mutants: Mutant) -> Path:
             str(kernel),
         )
         if firmware.sources:  # theirs, whose warnings are not ours
-            _run(*common, "-O1", "-w", "-r", "-nostdlib", *map(str, firmware.sources), "-o", str(stock))
+            run(*common, "-O1", "-w", "-r", "-nostdlib", *map(str, firmware.sources), "-o", str(stock))
     objects = [str(kernel), *([str(stock)] if firmware.sources else [])]
-    _run(*common, "-O0", "-w", "-shared", f'-DAPP="{mutated}"', str(SHIM), *objects, "-lm", "-o", str(out))
+    run(*common, "-O0", "-w", "-shared", f'-DAPP="{mutated}"', str(SHIM), *objects, "-lm", "-o", str(out))
     return out
 
 
-def _run(*command: str) -> None:
+def run(*command: str) -> None:
+    """Run a compiler; RuntimeError with what it says if it fails."""
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"{' '.join(command)}\n{done.stderr}")

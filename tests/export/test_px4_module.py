@@ -20,10 +20,12 @@ from test_px4 import shaped
 from cross_targets import need
 from experiments.firmware import betaflight_loop as hooks
 from experiments.firmware import crazyflie_loop as loop
-from experiments.firmware import px4_module as modules
+from experiments.firmware import px4_module_loop as modules
 from experiments.firmware.crazyflie_loop import Mutant, World
 from experiments.firmware.emitted import emitted as written
-from experiments.firmware.px4_module import Module
+from experiments.firmware.px4_module_loop import Module
+from experiments.firmware.px4_module_mistakes import mistakes
+from experiments.firmware.px4_module_rules import faults
 from qrl.export.firmware import px4
 from qrl.export.policy import Policy
 from qrl.export.quantize import quantize
@@ -123,9 +125,9 @@ def test_it_compiles_for_a_flight_controller(tmp_path: Path) -> None:
 
 
 def test_it_keeps_its_rules(tmp_path: Path) -> None:
-    """Registration, arming check, period, take-over, time-outs, set-points: `px4_module.faults`."""
+    """Registration, arming check, period, take-over, time-outs, set-points: `px4_module_rules`."""
     module = Module(emitted(steady(), tmp_path), NAME, tmp_path / "b")
-    assert list(modules.faults(module)) == []
+    assert list(faults(module)) == []
 
 
 def test_a_self_test_that_fails_registers_no_mode(tmp_path: Path) -> None:
@@ -151,7 +153,7 @@ def test_it_flies_as_the_kernel_does_and_mistakes_do_not(tmp_path: Path) -> None
     """
     policy, n, seconds = steady(), 2, 0.6
     folder, kernel = emitted(policy, tmp_path), quantize(policy)
-    wrong = {what: mutants for what, mutants in modules.mistakes(NAME).items() if what not in LEFT_OUT}
+    wrong = {what: mutants for what, mutants in mistakes(NAME).items() if what not in LEFT_OUT}
     right = Module(folder, NAME, tmp_path / "right")
     mutants = [Module(folder, NAME, tmp_path / f"mistake{i}", *each) for i, each in enumerate(wrong.values())]
     vehicles = [module.boot().register() for module in [right] * n + mutants]
@@ -162,7 +164,7 @@ def test_it_flies_as_the_kernel_does_and_mistakes_do_not(tmp_path: Path) -> None
     assert np.abs(flights[:, :n] - bare).max() < 1e-3
     astray = np.abs(flights[:, n:] - bare[:, :1]).max(axis=(0, 2)) > 0.01
     rest = [(what, module) for what, module, far in zip(wrong, mutants, astray, strict=True) if not far]
-    assert [what for what, module in rest if next(modules.faults(module), None) is None] == []
+    assert [what for what, module in rest if next(faults(module), None) is None] == []
 
 
 @pytest.mark.parametrize("make", [recurrent, any_vehicle], ids=["recurrent", "any"])
