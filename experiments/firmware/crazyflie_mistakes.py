@@ -44,11 +44,11 @@ def of_orders(NAME: str, policy: Policy) -> Mistakes:
         "forces as torques": one("controlModeForce;", "controlModeForceTorque;"),
     }
     if len(policy.observations) > 18:
-        unturned = "turned((const float[]){1.0f, 0.0f}, setpoint->acc"
+        as_given = "rotated((const float[]){1.0f, 0.0f}, setpoint->acc"
         found |= {
             "no acceleration ahead": each_axis("setpoint->acceleration.{} * t", "0.0f * t"),
             "no jerk ahead": one("half = 0.5f * t * t", "half = 0.0f"),
-            "acceleration not turned": one("turned(heading, setpoint->acc", unturned),
+            "acceleration not rotated": one("rotated(heading, setpoint->acc", as_given),
         }
     if policy.actions[0].quantity:
         return found | {"speed as force": one("action * (c + (1.0f - c) * action)", "action")}

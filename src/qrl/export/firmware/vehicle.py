@@ -147,5 +147,5 @@ PREVIEW = """
     static const float ahead_s[] = {{{times}}};
     for (int k = 0; k < {count}; ++k) {{
         const float t = ahead_s[k], half = 0.5f * t * t;
-        turned(heading, {along}, &obs[{NAME}_OBS_D1X + 3 * k]);
+        rotated(heading, {along}, &obs[{NAME}_OBS_D1X + 3 * k]);
     }}"""

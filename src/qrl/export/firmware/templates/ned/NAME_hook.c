@@ -38,7 +38,7 @@ static bool usable(const @name@_estimate *estimate, const @name@_setpoint *setpo
 }
 
 /* Writes a vector given in north, east, down to out in the policy's world: z up, x along the heading of the set-point. */
-static void turned(const float heading[2], const float north, const float east, const float down, float out[3]) {
+static void rotated(const float heading[2], const float north, const float east, const float down, float out[3]) {
     out[0] = heading[0] * north + heading[1] * east;
     out[1] = heading[1] * north - heading[0] * east;
     out[2] = -down;
@@ -57,15 +57,15 @@ static void observe(const @name@_estimate *estimate, const @name@_setpoint *setp
         {-2.0f * (x * z + w * y), -2.0f * (y * z - w * x), -1.0f + 2.0f * (x * x + y * y)},
     };
     for (int column = 0; column < 3; ++column) {
-        turned(heading, axes[column][0], axes[column][1], axes[column][2], axis);
+        rotated(heading, axes[column][0], axes[column][1], axes[column][2], axis);
         for (int row = 0; row < 3; ++row) {
             obs[@NAME@_OBS_R11 + 3 * row + column] = axis[row];
         }
     }
     const float *p = estimate->position_m, *v = estimate->velocity_m_s;
     const float *to = setpoint->position_m, *at = setpoint->velocity_m_s;
-    turned(heading, p[0] - to[0], p[1] - to[1], p[2] - to[2], &obs[@NAME@_OBS_PX]);
-    turned(heading, v[0] - at[0], v[1] - at[1], v[2] - at[2], &obs[@NAME@_OBS_VX]);
+    rotated(heading, p[0] - to[0], p[1] - to[1], p[2] - to[2], &obs[@NAME@_OBS_PX]);
+    rotated(heading, v[0] - at[0], v[1] - at[1], v[2] - at[2], &obs[@NAME@_OBS_VX]);
     obs[@NAME@_OBS_WX] = estimate->rates_rad_s[0];
     obs[@NAME@_OBS_WY] = -estimate->rates_rad_s[1];
     obs[@NAME@_OBS_WZ] = -estimate->rates_rad_s[2];@preview@

@@ -122,8 +122,8 @@ static uint8_t decide(const setpoint_t *setpoint, const uint32_t step) {
     return POLICY;
 }
 
-/* Writes a vector of the world to out, in the world turned about z so that its x axis is the heading of the set-point. */
-static void turned(const float heading[2], const float x, const float y, const float z, float out[3]) {
+/* Writes a vector of the world to out, in the world rotated about z so that its x axis is the heading of the set-point. */
+static void rotated(const float heading[2], const float x, const float y, const float z, float out[3]) {
     out[0] = heading[0] * x + heading[1] * y;
     out[1] = heading[0] * y - heading[1] * x;
     out[2] = z;
@@ -157,14 +157,14 @@ static void observe(const setpoint_t *setpoint, const sensorData_t *sensors, con
         {2.0f * (q.x * q.z + q.w * q.y), 2.0f * (q.y * q.z - q.w * q.x), 1.0f - 2.0f * (q.x * q.x + q.y * q.y)},
     };
     for (int column = 0; column < 3; ++column) {
-        turned(heading, axes[column][0], axes[column][1], axes[column][2], axis);
+        rotated(heading, axes[column][0], axes[column][1], axes[column][2], axis);
         for (int row = 0; row < 3; ++row) {
             obs[@NAME@_OBS_R11 + 3 * row + column] = axis[row];
         }
     }
-    turned(heading, state->position.x - setpoint->position.x, state->position.y - setpoint->position.y,
+    rotated(heading, state->position.x - setpoint->position.x, state->position.y - setpoint->position.y,
            state->position.z - setpoint->position.z, &obs[@NAME@_OBS_PX]);
-    turned(heading, state->velocity.x - setpoint->velocity.x, state->velocity.y - setpoint->velocity.y,
+    rotated(heading, state->velocity.x - setpoint->velocity.x, state->velocity.y - setpoint->velocity.y,
            state->velocity.z - setpoint->velocity.z, &obs[@NAME@_OBS_VX]);
     obs[@NAME@_OBS_WX] = sensors->gyro.x * RAD_PER_DEG;
     obs[@NAME@_OBS_WY] = sensors->gyro.y * RAD_PER_DEG;
