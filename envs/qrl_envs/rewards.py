@@ -1,6 +1,6 @@
 """Rewards of the paper (Sec. 5) and of Gymnasium's Pendulum-v1. For one state; the caller vmaps. All return []."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax.numpy as jnp
@@ -16,6 +16,19 @@ def _norm(x: chex.Array) -> chex.Array:
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
+class Near(NamedTuple):
+    """The cost of a distance d that is steep near 0, weight·d/(d + distance_m); scalars.
+
+    A cost in proportion to d says little about when a flight arrives: most of the sum is of the way far off.
+    """
+
+    weight: chex.Array
+    distance_m: chex.Array
+
+    def __call__(self, d: chex.Array) -> chex.Array:
+        return self.weight * d / (d + self.distance_m)
+
+
 class Hover(NamedTuple):
     """Weights of the hover reward; scalars."""
 
@@ -23,18 +36,18 @@ class Hover(NamedTuple):
     w1_attitude: chex.Array
     w2_position_1_m: chex.Array
     w3_action: chex.Array
+    near: Near | tuple[()] = ()
 
     def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
-        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) of the state after the step and the applied action [4].
+        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near(‖p_e‖) + w3·‖a‖) of the state after the step and the applied action [4].
 
         q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, the same attitude, cost the same.
         """
         w, *xyz = jnp.unstack(body.pose.attitude)
         q_e = jnp.stack([1.0 - jnp.abs(w), *xyz])
-        p_e = body.pose.position_m
-        return self.constant - (
-            self.w1_attitude * _norm(q_e) + self.w2_position_1_m * _norm(p_e) + self.w3_action * _norm(action)
-        )
+        p_e = _norm(body.pose.position_m)
+        cost = self.w1_attitude * _norm(q_e) + self.w2_position_1_m * p_e + self.w3_action * _norm(action)
+        return self.constant - (cost + self.near(p_e) if self.near else cost)
 
 
 class Circle(NamedTuple):
@@ -115,4 +128,9 @@ def from_spec(
 ) -> Hover | Circle | Track | SwingUp:
     """The reward of a task file, with its weights as float32 arrays."""
     kind = _FORMS[spec.form]
-    return kind(*(jnp.float32(getattr(spec, field)) for field in kind._fields))
+    weights: dict[str, Any] = {field: getattr(spec, field) for field in kind._fields}
+    near = weights.pop("near", None)
+    arrays: dict[str, Any] = {name: jnp.float32(weight) for name, weight in weights.items()}
+    if near is not None:
+        arrays["near"] = Near(jnp.float32(near.weight), jnp.float32(near.distance_m))
+    return kind(**arrays)

@@ -63,14 +63,22 @@ class Memory(Spec):
     integral: Integral | None = None
 
 
+class Near(Spec):
+    """A cost of the distance d that is steep near the point: weight·d/(d + distance_m)."""
+
+    weight: NonNegative
+    distance_m: Positive
+
+
 class HoverReward(Spec):
-    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + w3·‖a‖) (paper, Sec. 5)."""
+    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near + w3·‖a‖) (paper, Sec. 5, which has no `near`)."""
 
     form: Literal["hover"]
     constant: Real = 0.0
     w1_attitude: NonNegative
     w2_position_1_m: NonNegative
     w3_action: NonNegative
+    near: Near | None = later(None)
 
 
 class CircleReward(Spec):
@@ -107,7 +115,8 @@ class TrackReward(Spec):
 
 
 MOST_PREVIEW_S = 2.0
-LAGGED = "with_lag"  # key of a task file: what else it says where its vehicle has rotors that lag, or drag
+# Key of a task file: what else it says where its vehicle has rotors that lag, or drag, or where it is uncertain.
+LAGGED = "with_lag"
 W5_RADIUS_S_M = 0.5  # w5 of the 1 m circle
 
 FlightReward = Annotated[HoverReward | CircleReward | TrackReward, Field(discriminator="form")]
@@ -379,7 +388,7 @@ def from_data(
     lagged = data.pop(LAGGED, {})
     data = _with_parts(data, where, folder, parts)
     where += "".join(f" with {key} {asked}" for key, asked in parts.items() if asked is not None)
-    if _lags(data.get("vehicle")):
+    if _lags(data.get("vehicle")) or data.get("uncertainty"):
         left = {key: value for key, value in lagged.items() if parts.get(key) is None}
         data = _with_parts(specfile.merge(data, left), where, folder, {})
     return specfile.build(_ANY_TASK, _completed(data, where), where)

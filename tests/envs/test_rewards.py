@@ -49,7 +49,7 @@ each_form = pytest.mark.parametrize("form", ["hover", "circle"])
 def ours(form: str, w: dict, body: Body, action: Array) -> Array:
     """The reward of n states by qrl, its weights in double precision; a constant left out is zero."""
     kind: type[rewards.Hover] | type[rewards.Circle] = {"hover": rewards.Hover, "circle": rewards.Circle}[form]
-    reward = kind(*(jnp.float64(w.get(field, 0.0)) for field in kind._fields))
+    reward = kind(*(jnp.float64(w.get(field, 0.0)) for field in kind._fields if field != "near"))
     return np.asarray(OURS[form](reward, body, action))
 
 
@@ -108,6 +108,27 @@ def test_rewards_of_any_weights_are_the_papers(form: str, states: tuple[Body, Ar
     np.testing.assert_allclose(ours(form, w, *states), papers(form, w, *states), atol=1e-12)
 
 
+def test_near_cost_is_added_to_the_papers(states: tuple[Body, Array]) -> None:
+    """weight·d/(d + distance_m) of the distance d: half of the weight at `distance_m`."""
+    spec = task.load("hover").reward.model_copy(update={"near": task.Near(weight=0.4, distance_m=0.3)})
+    reward, plain = rewards.from_spec(spec), rewards.from_spec(task.load("hover").reward)
+    (body, action), d = states, np.linalg.norm(states[0].pose.position_m, axis=1)
+    added = jax.vmap(plain)(body, action) - jax.vmap(reward)(body, action)
+    np.testing.assert_allclose(added, 0.4 * d / (d + 0.3), atol=1e-6)
+
+
+def test_slope_of_the_near_cost_is_finite_at_the_point() -> None:
+    """weight/distance_m outward, and 0 at the point itself, where there is no outward."""
+    near = rewards.Near(jnp.float32(0.4), jnp.float32(0.3))
+    reward = rewards.Hover(*(jnp.float32(0.0) for _ in range(4)), near)
+
+    def value(p: Array) -> jax.Array:
+        return reward(Body(Pose(p, jnp.asarray(AT_REST)), Twist(jnp.zeros(3), jnp.zeros(3))), jnp.zeros(4))
+
+    np.testing.assert_array_equal(jax.grad(value)(jnp.zeros(3)), 0.0)
+    np.testing.assert_allclose(jax.grad(value)(jnp.array([0.0, 1e-6, 0.0])), [0.0, -0.4 / 0.3, 0.0], rtol=1e-4)
+
+
 def test_evaluation_of_hover_is_fields_reward() -> None:
     """FIELD.md: 1 − 0.2(‖q_e‖ + ‖p_e‖ + ‖a‖)."""
     w = weights("hover", "evaluation")
@@ -133,7 +154,7 @@ AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
 def test_gradients_at_the_goal_are_finite(form: str, position: list[float], dtype: type) -> None:
     """Where a norm is 0: no action, the point itself, upright, on the circle, on its axis; in what trains and here."""
     kind: Any = {"hover": rewards.Hover, "circle": rewards.Circle}[form]
-    reward = kind(*(dtype(WEIGHTS[form][field]) for field in kind._fields))
+    reward = kind(*(dtype(WEIGHTS[form][field]) for field in kind._fields if field != "near"))
 
     def value(p: Array, q: Array, v: Array, action: Array) -> jax.Array:
         return reward(Body(Pose(p, q), Twist(v, jnp.zeros_like(v))), action)
