@@ -183,7 +183,7 @@ class Vehicle(Spec):
             thrusts = inverse @ wanted
             if np.allclose(self.motor_axes @ thrusts, weight * direction, atol=1e-6 * weight):
                 break
-        return thrusts
+        return np.where(np.abs(thrusts) < 1e-9 * weight, 0.0, thrusts)  # rounding, which may be below 0
 
     @property
     def hover_speeds(self) -> np.ndarray:
