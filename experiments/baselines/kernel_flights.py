@@ -42,6 +42,8 @@ class Condition(NamedTuple):
     thrust: float = 1.0  # and the reaction torque, of every rotor
     lag: float = 1.0
     wind_m_s: float = 0.0  # along world x
+    late: int = 0  # control periods from set-points to rotors
+    told: str = "exact"  # what controllers are told of the flight: a key of `estimates.TOLD`
 
 
 CONDITIONS = (
@@ -50,6 +52,8 @@ CONDITIONS = (
     Condition("thrust × 0.85", thrust=0.85),
     Condition("lag × 2", lag=2.0),
     Condition("wind 2 m/s", wind_m_s=2.0),
+    Condition("noise, 10 ms late, mass × 1.2, wind 2 m/s", mass=1.2, wind_m_s=2.0, late=1, told="noise"),
+    Condition("position at 30 Hz, 10 ms late, bias", told="fixes"),
 )
 
 
@@ -309,9 +313,19 @@ def any_attitude(count: int, seed: int = STARTS_SEED) -> Start:
 STARTS = {"moderate": moderate, "any attitude": any_attitude}
 
 
-def fly(simulator: Simulator, controller: Controller, starts: Start, reference: Reference = HOVER) -> Array:
+def fly(
+    simulator: Simulator,
+    controller: Controller,
+    starts: Start,
+    reference: Reference = HOVER,
+    told: Any = None,
+    late: int = 0,
+) -> Array:
     """Distances from the reference [n, steps] in meters after each period; infinite once lost. The starts are about
     where it begins, and at its velocity.
+
+    The controller is `told` of the flight what an `estimates.Exact` says, by default what is; from the position that
+    it is told so the bias that nobody can know is taken. Its set-points act so many periods `late`.
     """
     count, origin = len(starts.quaternion), Target(reference, 0)
     begun = starts.states()._replace(
@@ -320,14 +334,17 @@ def fly(simulator: Simulator, controller: Controller, starts: Start, reference: 
     simulator.start(begun)
     controller.reset(count)
     flying = np.ones(count, bool)
-    states, distances = begun, []
+    states, distances, waiting = begun, [], []
     with np.errstate(all="ignore"):  # a lost flight may overflow
         for step in range(reference.steps):
             target = Target(reference, step)
-            simulator.step(controller.act(_level_where_lost(states, flying), target), flying)
+            seen = _level_where_lost(states, flying)
+            seen = told.told(seen, step * PERIOD_S) if told else seen
+            waiting.append(controller.act(seen, target))
+            simulator.step(waiting.pop(0) if len(waiting) > late else waiting[0], flying)
             states = simulator.states()
             error = relative(states, Target(reference, step + 1))
-            distance = np.linalg.norm(error.position_m, axis=1)
+            distance = np.linalg.norm(error.position_m + (told.bias_m() if told else 0.0), axis=1)
             rate = np.linalg.norm(error.body_rate_rad_s, axis=1)
             flying &= (distance < LOST_M) & (rate < LOST_RAD_S)  # a NaN is not less
             distances.append(np.where(flying, distance, np.inf))
@@ -367,7 +384,9 @@ def tournament(
     """Report a line for each reference, kind of starts, condition and controller; `simulator`: of a condition and a
     controller. Figures are flown from moderate starts.
     """
-    from judge import report  # beside this file, where it is a script's; experiments.bench.judges needs no clock
+    # Beside this file, where it is a script's; experiments.bench.judges needs neither.
+    from estimates import TOLD
+    from judge import report
 
     for reference in references:
         for kind, draw in STARTS.items():
@@ -375,7 +394,8 @@ def tournament(
                 continue
             for condition in CONDITIONS:
                 for name, controller in controllers.items():
-                    flown = fly(simulator(condition, name), controller, draw(starts), reference)
+                    told = TOLD[condition.told](starts)
+                    flown = fly(simulator(condition, name), controller, draw(starts), reference, told, condition.late)
                     said = {"reference": reference.name, "starts": kind, "flights": starts}
                     said |= {"condition": condition.name, "controller": name}
                     report(said | summary(flown, reference.tail))

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.baselines import kernel_flights
+from experiments.baselines import estimates, kernel_flights
 from experiments.baselines.kernel_flights import PERIOD_S, Given, Reference, Rotors, State
 from experiments.bench.contestants import Contestant, key
 from experiments.bench.install import fingerprint
@@ -171,7 +171,7 @@ def manifest_of(kernel: Path | None) -> dict[str, Any] | None:
 
 def inputs(contestant: Contestant, kernel: Path | None, starts: int, task: str) -> dict[str, Any]:
     """What the flights depend on: hashes of code, vehicle, requirements and kernel."""
-    modules = (kernel_flights, reference, plant)
+    modules = (kernel_flights, estimates, reference, plant)
     code = [BASELINES / contestant.script, Path(__file__), *(Path(str(module.__file__)) for module in modules)]
     shipped = load("hover", VEHICLES[contestant.words[0]]).model_dump_json()
     return {

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.baselines import kernel_flights
+from experiments.baselines import estimates, kernel_flights
 from experiments.baselines.kernel_flights import RAPTOR_ROTORS, Rotors, State
 from experiments.bench import judges
 from experiments.bench.contestants import JUDGES, Contestant
@@ -108,6 +108,52 @@ class Watcher:
         error = kernel_flights.relative(states, target)
         self._seen.append([*error.position_m[0], *error.velocity_m_s[0], *target.preview_m_s([50])])
         return np.zeros((1, 4))
+
+
+def moving(time_s: float) -> State:
+    """Three vehicles that are level and accelerate each in its own way."""
+    acceleration = np.array([[0.0, 0.0, 0.0], [2.0, 0.0, -1.0], [0.0, 3.0, 0.0]])
+    velocity = np.array([[1.0, -2.0, 0.5], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    position = np.array([[0.0, 1.0, 2.0]]).T + velocity * time_s + 0.5 * acceleration * time_s**2
+    return State(np.tile(np.eye(3), (3, 1, 1)), position, velocity + acceleration * time_s, np.zeros((3, 3)))
+
+
+def test_noise_has_the_deviations_that_are_said() -> None:
+    still = State(np.tile(np.eye(3), (4000, 1, 1)), *np.zeros((3, 4000, 3)))
+    told = estimates.Noise(4000).told(still, 0.0)
+    turned = np.stack([told.rotation[:, 2, 1], told.rotation[:, 0, 2], told.rotation[:, 1, 0]], axis=1)
+    for found, size in zip((turned, *told[1:]), (0.01, 0.01, 0.02, 0.02), strict=True):
+        np.testing.assert_allclose(found.std(axis=0), size, rtol=0.05)
+    np.testing.assert_allclose(told.rotation @ told.rotation.transpose(0, 2, 1), still.rotation, atol=1e-12)
+
+
+def test_fixes_are_late_and_the_velocity_is_of_the_last_two(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steady motion is told as it is; under an acceleration the velocity is that of half a period before the fix."""
+    monkeypatch.setattr(estimates, "WANDER_M", 0.0)
+    fixes, late = estimates.Fixes(3), []
+    for step in range(100):
+        time_s = 0.01 * step
+        true, told = moving(time_s), fixes.told(moving(time_s), time_s)
+        np.testing.assert_allclose(told.position_m[0], true.position_m[0], atol=1e-12)
+        np.testing.assert_allclose(told.velocity_m_s[0], true.velocity_m_s[0], atol=1e-9)
+        late.append((true.velocity_m_s - told.velocity_m_s)[1:] / [[2.0, 1.0, 1.0], [1.0, 3.0, 1.0]])
+    ages_s = np.array(late)[10:, [0, 1], [0, 1]]  # of the middle of the last two fixes
+    assert 0.01 + 1 / 60 - 1e-3 < ages_s.min() < 0.01 + 1 / 60 + 0.01
+    assert 0.01 + 3 / 60 - 0.01 < ages_s.max() < 0.01 + 3 / 60 + 1e-3
+
+
+def test_the_bias_is_in_what_is_told_and_wanders_as_is_said() -> None:
+    still = State(np.tile(np.eye(3), (2000, 1, 1)), *np.zeros((3, 2000, 3)))
+    fixes, biases = estimates.Fixes(2000), []
+    for step in range(520):
+        told = fixes.told(still, 0.01 * step)
+        biases.append(fixes.bias_m())
+        # Within what the velocity of two biases makes of a fix's age, which is 43 ms at most.
+        np.testing.assert_allclose(told.position_m, biases[-1], atol=0.01)
+    assert np.std(biases[0]) == pytest.approx(0.005, rel=0.05)
+    assert np.std(biases[-1]) == pytest.approx(0.005, rel=0.05)
+    alike = np.mean(biases[0] * biases[500]) / 0.005**2  # after five seconds, one correlation time
+    assert alike == pytest.approx(np.exp(-1.0), abs=0.06)
 
 
 def test_our_plant_hovers_under_the_thrusts_of_hover() -> None:
