@@ -389,6 +389,10 @@ def test_a_real_vehicle_has_uncertainty_and_memory_unless_the_file_says_other(pa
     papers = task.load("hover")
     assert isinstance(papers, task.QuadrotorTask)
     assert papers.ideal
+    drawn = task.load("hover", uncertainty="default")  # what is uncertain has to be found out, whatever the vehicle
+    assert isinstance(drawn, task.QuadrotorTask)
+    assert (drawn.memory, drawn.policy_frame, drawn.preset) == (real.memory, "body", "hover_real")
+    assert task.load("hover", uncertainty="none").preset == "hover"
     with pytest.raises(BadInput, match="unknown uncertainty 'non'"):
         task.load("hover", uncertainty="non")
 
