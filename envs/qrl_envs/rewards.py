@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import chex
 import jax.numpy as jnp
 
+from qrl_envs import task
 from qrl_envs.pendulum import Pendulum
 from qrl_envs.quadrotor import Body
 from qrl_envs.task import CircleReward, HoverReward, PendulumReward, TrackReward
@@ -29,6 +30,13 @@ class Near(NamedTuple):
         return self.weight * d / (d + self.distance_m)
 
 
+def _change(weight: chex.Array | tuple[()], action: chex.Array, before: chex.Array | None) -> chex.Array | float:
+    """weight·‖Δa‖² of an action [A] and the one `before` it; 0 without a weight, or at the first."""
+    if isinstance(weight, tuple) or before is None:
+        return 0.0
+    return weight * jnp.sum((action - before) ** 2, axis=0)
+
+
 class Hover(NamedTuple):
     """Weights of the hover reward; scalars."""
 
@@ -37,9 +45,10 @@ class Hover(NamedTuple):
     w2_position_1_m: chex.Array
     w3_action: chex.Array
     near: Near | tuple[()] = ()
+    w_change: chex.Array | tuple[()] = ()
 
     def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
-        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near(‖p_e‖) + w3·‖a‖) of the state after the step and the applied action [4].
+        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near(‖p_e‖) + w3·‖a‖ + w_change·‖Δa‖²) of the state after the step and the applied action [4].
 
         q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, the same attitude, cost the same.
         """
@@ -47,7 +56,8 @@ class Hover(NamedTuple):
         q_e = jnp.stack([1.0 - jnp.abs(w), *xyz])
         p_e = _norm(body.pose.position_m)
         cost = self.w1_attitude * _norm(q_e) + self.w2_position_1_m * p_e + self.w3_action * _norm(action)
-        return self.constant - (cost + self.near(p_e) if self.near else cost)
+        cost = cost + self.near(p_e) if self.near else cost
+        return self.constant - (cost + _change(self.w_change, action, before))
 
 
 class Circle(NamedTuple):
@@ -59,9 +69,10 @@ class Circle(NamedTuple):
     w6_action: chex.Array
     radius_m: chex.Array
     speed_m_s: chex.Array
+    w_change: chex.Array | tuple[()] = ()
 
     def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
-        """constant − (w4·d + w5·|chi| + w6·‖a‖) of the state after the step and the applied action [4].
+        """constant − (w4·d + w5·|chi| + w6·‖a‖ + w_change·‖Δa‖²) of the state after the step and the applied action [4].
 
         d is the distance to the circle and chi = x·vy − y·vx − r_des·v_des (paper, Sec. 5.3).
         """
@@ -70,7 +81,10 @@ class Circle(NamedTuple):
         d = _norm(jnp.stack([_norm(jnp.stack([x, y])) - self.radius_m, z]))
         chi = x * vy - y * vx - self.radius_m * self.speed_m_s
         return self.constant - (
-            self.w4_distance_1_m * d + self.w5_direction_s_m2 * jnp.abs(chi) + self.w6_action * _norm(action)
+            self.w4_distance_1_m * d
+            + self.w5_direction_s_m2 * jnp.abs(chi)
+            + self.w6_action * _norm(action)
+            + _change(self.w_change, action, before)
         )
 
 
@@ -97,13 +111,12 @@ class Track(NamedTuple):
         square = jnp.sum(body.pose.position_m**2, axis=0)
         distance = jnp.sqrt(square + self.rounding_m**2) - self.rounding_m
         rate = jnp.sum(body.twist.body_rate_rad_s**2, axis=0)
-        change = 0.0 if before is None else jnp.sum((action - before) ** 2, axis=0)
         return self.constant - (
             self.w_position_1_m * distance
             + self.w_velocity_s_m * _norm(body.twist.velocity_m_s)
             + self.w_body_rate_s2_rad2 * rate
             + self.w_heading * z * z / (w * w + z * z + HEADING_MARGIN)
-            + self.w_change * change
+            + _change(self.w_change, action, before)
         )
 
 
@@ -127,10 +140,13 @@ def from_spec(
     spec: HoverReward | CircleReward | TrackReward | PendulumReward,
 ) -> Hover | Circle | Track | SwingUp:
     """The reward of a task file, with its weights as float32 arrays."""
-    kind = _FORMS[spec.form]
+    kind, optional = _FORMS[spec.form], _FORMS[spec.form]._field_defaults
     weights: dict[str, Any] = {field: getattr(spec, field) for field in kind._fields}
-    near = weights.pop("near", None)
-    arrays: dict[str, Any] = {name: jnp.float32(weight) for name, weight in weights.items()}
-    if near is not None:
-        arrays["near"] = Near(jnp.float32(near.weight), jnp.float32(near.distance_m))
-    return kind(**arrays)
+    asked = {name: weight for name, weight in weights.items() if weight or name not in optional}
+    return kind(**{name: _array(weight) for name, weight in asked.items()})
+
+
+def _array(weight: Any) -> Any:
+    if isinstance(weight, task.Near):
+        return Near(jnp.float32(weight.weight), jnp.float32(weight.distance_m))
+    return jnp.float32(weight)

@@ -71,7 +71,9 @@ class Near(Spec):
 
 
 class HoverReward(Spec):
-    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near + w3·‖a‖) (paper, Sec. 5, which has no `near`)."""
+    """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near + w3·‖a‖ + w_change·‖Δa‖²) (paper, Sec. 5, which has neither `near` nor
+    the change Δa of the action).
+    """
 
     form: Literal["hover"]
     constant: Real = 0.0
@@ -79,10 +81,11 @@ class HoverReward(Spec):
     w2_position_1_m: NonNegative
     w3_action: NonNegative
     near: Near | None = later(None)
+    w_change: NonNegative = later(0.0)
 
 
 class CircleReward(Spec):
-    """constant − (w4·d + w5·|chi| + w6·‖a‖) (paper, Sec. 5.3)."""
+    """constant − (w4·d + w5·|chi| + w6·‖a‖ + w_change·‖Δa‖²) (paper, Sec. 5.3, without the change Δa of the action)."""
 
     form: Literal["circle"]
     constant: Real = 0.0
@@ -91,6 +94,7 @@ class CircleReward(Spec):
     w6_action: NonNegative
     radius_m: Positive
     speed_m_s: Real  # above 0: counter-clockwise seen from above
+    w_change: NonNegative = later(0.0)
 
     @model_validator(mode="after")
     def _moves(self) -> "CircleReward":

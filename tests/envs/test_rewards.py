@@ -49,7 +49,7 @@ each_form = pytest.mark.parametrize("form", ["hover", "circle"])
 def ours(form: str, w: dict, body: Body, action: Array) -> Array:
     """The reward of n states by qrl, its weights in double precision; a constant left out is zero."""
     kind: type[rewards.Hover] | type[rewards.Circle] = {"hover": rewards.Hover, "circle": rewards.Circle}[form]
-    reward = kind(*(jnp.float64(w.get(field, 0.0)) for field in kind._fields if field != "near"))
+    reward = kind(*(jnp.float64(w.get(field, 0.0)) for field in kind._fields if field not in ("near", "w_change")))
     return np.asarray(OURS[form](reward, body, action))
 
 
@@ -154,7 +154,7 @@ AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
 def test_gradients_at_the_goal_are_finite(form: str, position: list[float], dtype: type) -> None:
     """Where a norm is 0: no action, the point itself, upright, on the circle, on its axis; in what trains and here."""
     kind: Any = {"hover": rewards.Hover, "circle": rewards.Circle}[form]
-    reward = kind(*(dtype(WEIGHTS[form][field]) for field in kind._fields if field != "near"))
+    reward = kind(*(dtype(WEIGHTS[form][field]) for field in kind._fields if field not in ("near", "w_change")))
 
     def value(p: Array, q: Array, v: Array, action: Array) -> jax.Array:
         return reward(Body(Pose(p, q), Twist(v, jnp.zeros_like(v))), action)
