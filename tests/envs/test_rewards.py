@@ -117,6 +117,17 @@ def test_near_cost_is_added_to_the_papers(states: tuple[Body, Array]) -> None:
     np.testing.assert_allclose(added, 0.4 * d / (d + 0.3), atol=1e-6)
 
 
+@each_form
+def test_a_change_of_action_costs_its_square(form: str, states: tuple[Body, Array]) -> None:
+    """w_change·‖a − a_before‖², and nothing where there is no action before."""
+    spec = task.load(form).reward
+    reward, plain = rewards.from_spec(spec.model_copy(update={"w_change": 0.25})), rewards.from_spec(spec)
+    (body, action), before = states, np.random.default_rng(3).uniform(-1.0, 1.0, states[1].shape)
+    cost = jax.vmap(plain)(body, action, before) - jax.vmap(reward)(body, action, before)
+    np.testing.assert_allclose(cost, 0.25 * np.sum((action - before) ** 2, axis=1), rtol=1e-4, atol=1e-6)
+    np.testing.assert_array_equal(jax.vmap(reward)(body, action), jax.vmap(plain)(body, action))
+
+
 def test_slope_of_the_near_cost_is_finite_at_the_point() -> None:
     """weight/distance_m outward, and 0 at the point itself, where there is no outward."""
     near = rewards.Near(jnp.float32(0.4), jnp.float32(0.3))
