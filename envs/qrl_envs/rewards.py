@@ -48,7 +48,8 @@ class Hover(NamedTuple):
     w_change: chex.Array | tuple[()] = ()
 
     def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
-        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near(‖p_e‖) + w3·‖a‖ + w_change·‖Δa‖²) of the state after the step and the applied action [4].
+        """constant − (w1·‖q_e‖ + w2·‖p_e‖ + near(‖p_e‖) + w3·‖a‖ + w_change·‖Δa‖²) of the state after the step, the
+        applied action [4] and the one before it.
 
         q_e = [1 − |w|, x, y, z] of the attitude quaternion, so that q and −q, the same attitude, cost the same.
         """
@@ -72,7 +73,8 @@ class Circle(NamedTuple):
     w_change: chex.Array | tuple[()] = ()
 
     def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
-        """constant − (w4·d + w5·|chi| + w6·‖a‖ + w_change·‖Δa‖²) of the state after the step and the applied action [4].
+        """constant − (w4·d + w5·|chi| + w6·‖a‖ + w_change·‖Δa‖²) of the state after the step, the applied action [4]
+        and the one before it.
 
         d is the distance to the circle and chi = x·vy − y·vx − r_des·v_des (paper, Sec. 5.3).
         """

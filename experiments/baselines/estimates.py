@@ -115,7 +115,8 @@ def _turns(angles_rad: Array) -> Array:
     x, y, z = 0.5 * angles_rad.T
     zero = np.zeros_like(x)
     cross = np.moveaxis(np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]), -1, 0)
-    return np.linalg.solve(np.eye(3) - cross, np.eye(3) + cross)
+    turns: Array = np.linalg.solve(np.eye(3) - cross, np.eye(3) + cross).astype(np.float64)
+    return turns
 
 
 TOLD = {"exact": Exact, "noise": Noise, "fixes": Fixes}
