@@ -15,6 +15,7 @@ LEAST_ANGULAR_ACCELERATION_RAD_S2 = 3.0  # about x and y, below which a vehicle 
 LEAST_YAW_ACCELERATION_RAD_S2 = 0.3
 RECOVERY_M = 2.0
 LEAST_AXIS = 1e-3  # length
+MOST_SCALE_PER_THRUST = 2.0  # action_scale_N per greatest thrust of a motor, above which actions hardly grade thrusts
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover
 
 
@@ -221,6 +222,11 @@ class Vehicle(Spec):
             found.append("its motors cannot turn it about all axes independently: check motors.spin")
         if (yaw := self.angular_acceleration_rad_s2[2]) < LEAST_YAW_ACCELERATION_RAD_S2:
             found.append(f"it can hardly turn about body z ({yaw:.2g} rad/s²): check yaw_moment_m, N m per N of thrust")
+        if self.action_scale_N > MOST_SCALE_PER_THRUST * (most := max(motor.max_N for motor in self.motors)):
+            found.append(
+                f"action_scale_N is {self.action_scale_N:g} N and no motor has more than {most:g} N, so nearly every"
+                " action is a motor's limit; a file that extends a task keeps its vehicle's where it does not give its own"
+            )
         return found
 
 

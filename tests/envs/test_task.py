@@ -313,6 +313,7 @@ def test_what_can_only_just_fly_is_warned_about(path: Path) -> None:
             "all axes independently",
         ),
         ({"yaw_moment_m": 1e-9}, "hardly turn about body z"),
+        ({"action_scale_N": 20.0}, "nearly every action is a motor's limit"),
     ):
         (warning,) = load(path, vehicle(changes)).warnings()
         assert words in warning
