@@ -225,7 +225,7 @@ class Vehicle(Spec):
         if self.action_scale_N > MOST_SCALE_PER_THRUST * (most := max(motor.max_N for motor in self.motors)):
             found.append(
                 f"action_scale_N is {self.action_scale_N:g} N and no motor has more than {most:g} N, so nearly every"
-                " action is a motor's limit; a file that extends a task keeps its vehicle's where it does not give its own"
+                " action is a motor's limit; a file that extends a task has its vehicle's unless it gives one"
             )
         return found
 
