@@ -1,6 +1,7 @@
 """What a controller is told of a flight in a judge: late actions, noise, and positions as an estimator gives them.
 
-NumPy only, as `kernel_flights`. n flights side by side; all of a flight's random numbers come from one seed.
+NumPy only, as `kernel_flights`; the magnitudes are those of `qrl_envs.off_nominal`. n flights side by side; all of a
+flight's random numbers come from one seed.
 """
 
 import math

@@ -11,6 +11,7 @@ from experiments.baselines import estimates, kernel_flights
 from experiments.baselines.kernel_flights import RAPTOR_ROTORS, Rotors, State
 from experiments.bench import judges
 from experiments.bench.contestants import JUDGES, Contestant
+from qrl_envs import off_nominal
 
 # Front left, front right, back right, back left, as rotorpy numbers them.
 ROTORPY = Rotors(0.0304 * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]), np.array([1, -1, 1, -1]))
@@ -121,10 +122,26 @@ def moving(time_s: float) -> State:
 def test_noise_has_the_deviations_that_are_said() -> None:
     still = State(np.tile(np.eye(3), (4000, 1, 1)), *np.zeros((3, 4000, 3)))
     told = estimates.Noise(4000).told(still, 0.0)
-    turned = np.stack([told.rotation[:, 2, 1], told.rotation[:, 0, 2], told.rotation[:, 1, 0]], axis=1)
-    for found, size in zip((turned, *told[1:]), (0.01, 0.01, 0.02, 0.02), strict=True):
+    angles = np.stack([told.rotation[:, 2, 1], told.rotation[:, 0, 2], told.rotation[:, 1, 0]], axis=1)
+    for found, size in zip((angles, *told[1:]), (0.01, 0.01, 0.02, 0.02), strict=True):
         np.testing.assert_allclose(found.std(axis=0), size, rtol=0.05)
     np.testing.assert_allclose(told.rotation @ told.rotation.transpose(0, 2, 1), still.rotation, atol=1e-12)
+
+
+def test_judges_err_as_our_own_evaluation_does() -> None:
+    """In two files, since a judge's environment has no qrl_envs."""
+    noise = {
+        "position_noise_m": estimates.POSITION_M,
+        "velocity_noise_m_s": estimates.VELOCITY_M_S,
+        "attitude_noise_rad": estimates.ATTITUDE_RAD,
+        "body_rate_noise_rad_s": estimates.BODY_RATE_RAD_S,
+    }
+    fixes = {
+        "position_period_s": estimates.FIX_PERIOD_S,
+        "position_delay_s": estimates.FIX_DELAY_S,
+        "bias_wander_m": estimates.WANDER_M,
+    }
+    assert (noise, fixes) == (off_nominal.NOISE, off_nominal.FIXES)
 
 
 def test_fixes_are_late_and_the_velocity_is_of_the_last_two(monkeypatch: pytest.MonkeyPatch) -> None:
