@@ -13,11 +13,12 @@ import jax.numpy as jnp
 
 from qrl.algorithm import learner
 from qrl.algorithm.adapter import adapt
+from qrl.algorithm.carried import Carried
 from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
-from qrl.algorithm.types import Env, State, TaskEnv, info_flag
+from qrl.algorithm.types import Env, State, info_flag
 from qrl.config import Hyperparameters
 
-# memory [n, H] or (), observations [n, F] -> next memory, mean actions [n, A]
+# memory [n, H] or (), what a policy sees [n, I] -> next memory, mean actions [n, A]
 Act = Callable[[Any, chex.Array], tuple[Any, chex.Array]]
 
 
@@ -70,42 +71,40 @@ def returns(
         start, noise = jax.random.split(key)
         return env.reset(start), jax.random.normal(noise, (steps, env.action_size))
 
+    def step_of(state: State, action: chex.Array) -> State:
+        return seen_of(env.step_lanes(state, action))
+
+    def seen_of(state: State) -> State:
+        return state.replace(obs=state.obs[: env.policy_observation_size])  # a critic is not asked
+
     # Flights lie along the last axis: so a CPU takes vectors of them.
     states, noise = jax.vmap(one, out_axes=-1)(keys)
-    constant = _constant_leaves(env, states, noise[0])
+    states = seen_of(states)
+    carried = Carried(step_of, states, noise[0], _wanted)
 
-    def changing_of(state: State) -> State:
-        return jax.tree.map(lambda x, same: None if same else x, state, constant)
-
-    def step(carry: tuple[State, Any, chex.Array], noise: chex.Array) -> tuple[tuple[State, Any, chex.Array], Any]:
-        changing, memory, alive = carry
-        state = jax.tree.map(lambda x, first: first if x is None else x, changing, states, is_leaf=lambda x: x is None)
+    def step(carry: tuple[Any, Any, chex.Array], noise: chex.Array) -> tuple[tuple[Any, Any, chex.Array], Any]:
+        packed, memory, alive = carry
+        state = carried.unpack(packed)
         memory, mean = policy(jax.tree.map(jnp.transpose, memory), state.obs.T)
         memory = jax.tree.map(jnp.transpose, memory)
-        after = env.step_lanes(state, jnp.clip(mean.T + sigma * noise, -1.0, 1.0))
+        after = step_of(state, jnp.clip(mean.T + sigma * noise, -1.0, 1.0))
         charge = jnp.where(info_flag(state, "out_of_bounds"), state.reward, jnp.minimum(state.reward, 0.0))
         reward = jnp.where(alive > 0, after.reward, charge)
-        changing = jax.tree.map(lambda new, old: jnp.where(alive > 0, new, old), changing_of(after), changing)
+        packed = jax.tree.map(lambda new, old: jnp.where(alive > 0, new, old), carried.pack(after), packed)
         if cotangent_norm is not None:
             # The observation too: through it alone the next action depends on this one.
-            changing, memory = _bounded((changing, memory), cotangent_norm)
-        return (changing, memory, alive * (1.0 - after.done)), reward
+            packed, memory = _bounded((packed, memory), cotangent_norm)
+        return (packed, memory, alive * (1.0 - after.done)), reward
 
     # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.
-    first = changing_of(states), jax.tree.map(jnp.transpose, memory), jnp.ones_like(states.reward)
+    first = carried.pack(states), jax.tree.map(jnp.transpose, memory), jnp.ones_like(states.reward)
     (_, _, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, noise)
     return jnp.sum(rewards, axis=0), alive > 0
 
 
-def _constant_leaves(env: TaskEnv, states: State, action: chex.Array) -> Any:
-    """Of each leaf of a batch of states, whether a step passes it on as it is; a tree of bool.
-
-    What is constant during a flight stays out of the loop over steps, and so does its gradient.
-    """
-    leaves, structure = jax.tree.flatten(states)
-    jaxpr = jax.make_jaxpr(env.step_lanes)(states, action).jaxpr
-    same = [new is old for new, old in zip(jaxpr.outvars, jaxpr.invars[: len(leaves)], strict=True)]
-    return jax.tree.unflatten(structure, same)
+def _wanted(state: State) -> Any:
+    """What `returns` takes of a state."""
+    return state.obs, state.reward, state.done, state.info.get("out_of_bounds")
 
 
 def decay(progress: chex.Array) -> chex.Array:
