@@ -103,6 +103,7 @@ class Track(NamedTuple):
     w_body_rate_s2_rad2: chex.Array
     w_heading: chex.Array
     w_change: chex.Array
+    near: Near | tuple[()] = ()
 
     def __call__(self, body: Body, action: chex.Array, before: chex.Array | None = None) -> chex.Array:
         """Of the state after the step relative to the reference, its applied action [A], and the one `before` [A].
@@ -113,8 +114,10 @@ class Track(NamedTuple):
         square = jnp.sum(body.pose.position_m**2, axis=0)
         distance = jnp.sqrt(square + self.rounding_m**2) - self.rounding_m
         rate = jnp.sum(body.twist.body_rate_rad_s**2, axis=0)
+        near = self.near(distance) if self.near else 0.0
         return self.constant - (
             self.w_position_1_m * distance
+            + near
             + self.w_velocity_s_m * _norm(body.twist.velocity_m_s)
             + self.w_body_rate_s2_rad2 * rate
             + self.w_heading * z * z / (w * w + z * z + HEADING_MARGIN)

@@ -104,8 +104,8 @@ class CircleReward(Spec):
 
 
 class TrackReward(Spec):
-    """constant − (w_position·(√(‖e‖² + rounding_m²) − rounding_m) + w_velocity·‖ė‖ + w_body_rate·‖ω‖² +
-    w_heading·sin²(ψ/2) + w_change·‖Δa‖²) of the error e to a reference, the heading ψ and the change of action Δa.
+    """constant − (w_position·d + near + w_velocity·‖ė‖ + w_body_rate·‖ω‖² + w_heading·sin²(ψ/2) + w_change·‖Δa‖²) of
+    the error e to a reference, its d = √(‖e‖² + rounding_m²) − rounding_m, the heading ψ and the change of action Δa.
     """
 
     form: Literal["track"]
@@ -116,6 +116,7 @@ class TrackReward(Spec):
     w_body_rate_s2_rad2: NonNegative
     w_heading: NonNegative
     w_change: NonNegative
+    near: Near | None = later(None)
 
 
 MOST_PREVIEW_S = 2.0

@@ -477,6 +477,25 @@ def test_the_gradient_with_respect_to_a_state_is_cut(limit: float) -> None:
     assert ours == pytest.approx(expected, rel=1e-4)
 
 
+def test_the_cut_of_a_flights_gradient_does_not_depend_on_how_many_fly() -> None:
+    """The same flights twice: the same mean gradient, where the bound is at work."""
+    ours, keys = learner(), jax.random.split(jax.random.PRNGKey(0), 3)
+    state = ours.init(jax.random.PRNGKey(1))
+
+    def gradient(keys: jax.Array, limit: float | None) -> float:
+        def flown(now: LearnerState) -> tuple[jax.Array, jax.Array]:
+            def act(memory: Any, x: jax.Array) -> tuple[Any, jax.Array]:
+                return memory, ours.mean(now, jnp.concatenate([x, x], axis=-1))
+
+            return analytic_gradient.returns(Growing(), act, (), jnp.float32(0.1), keys, 6, limit)
+
+        return float(ours.apg_update(state, flown, jnp.float32(0.0))[1].policy_gradient)
+
+    once, free = gradient(keys, 0.01), gradient(keys, None)
+    assert gradient(jnp.concatenate([keys, keys]), 0.01) == pytest.approx(once, rel=1e-5)
+    assert once < 0.9 * free
+
+
 def test_the_first_updates_are_split_into_shorter_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As many as the fraction says, rounded up, each with a key, a progress and flights of its own.
 

@@ -134,9 +134,12 @@ def update(
 
     def loss(policy: chex.ArrayTree) -> tuple[chex.Array, chex.Array]:
         values, complete = returns_of(state._replace(params=state.params._replace(policy=policy)))
-        return -jnp.mean(values), jnp.stack([jnp.mean(values), jnp.mean(complete)])
+        return -jnp.sum(values), len(values) * jnp.stack([jnp.mean(values), jnp.mean(complete), 1.0])
 
-    gradient, means = learner.mean_over_devices(spec, jax.grad(loss, has_aux=True)(before))
+    # Divided after the way back: a bound there is on the gradient of one flight's return, however many fly beside it.
+    sums = jax.grad(loss, has_aux=True)(before)
+    flights = sums[1][2]
+    gradient, means = learner.mean_over_devices(spec, jax.tree.map(lambda x: x / flights, sums))
     rate = decay(progress) * hyper.apg_learning_rate
     after, optimizer_after, norm = learner.apply_gradient(hyper, before, gradient, optimizer, rate)
     finite = jnp.isfinite(norm)
@@ -152,4 +155,4 @@ def update(
     zero = jnp.zeros(())
     metrics = UpdateMetrics(*[zero] * len(UpdateMetrics._fields))
     metrics = metrics._replace(policy_loss=-means[0], policy_gradient=jnp.where(finite, norm, 0.0))
-    return state, metrics, spec.config.apg_num_envs * means, ~finite
+    return state, metrics, spec.config.apg_num_envs * means[:2], ~finite
