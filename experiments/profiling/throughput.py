@@ -70,7 +70,7 @@ def acting(lanes: int, key: jax.Array) -> None:
 
     layout = LAYOUT.lanes, LAYOUT.buffer
     program = shard_map(trainer.setup.mesh, act, (P(MEMBER), layout, P()), layout)
-    compiled = jax.jit(program, donate_argnums=1, compiler_options=xla_effort(1))
+    compiled = jax.jit(program, donate_argnums=1, compiler_options=xla_effort(1, lanes))
     members = states.learner, states.start_key, points
 
     def call(carry: Any) -> Any:
@@ -106,7 +106,7 @@ def physics(lanes: int, key: jax.Array) -> None:
     thrusts = params.physics.hover_thrust_N * factor
     if mesh:
         bodies, thrusts = jax.device_put((bodies, thrusts), NamedSharding(mesh, P(SHARD)))
-    step = partial(jax.jit(steps, compiler_options=xla_effort(1)), jax.tree.map(jnp.asarray, params.physics), thrusts)
+    step = partial(jax.jit(steps, compiler_options=xla_effort(1, lanes)), jax.tree.map(jnp.asarray, params.physics), thrusts)
     rate(f"physics, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
 
 

@@ -32,6 +32,6 @@ def fusions_of_a_user() -> Iterator[None]:
     for the programs of trainers that are made within, and for processes.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "xla_effort", lambda _: {FUSIONS.removeprefix("--"): True})
+        patch.setattr(trainer, "xla_effort", lambda *_: {FUSIONS.removeprefix("--"): True})
         patch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "").replace(HASTY, "").strip())
         yield

@@ -26,6 +26,7 @@ from qrl.training import sharding
 from qrl.training.sharding import LAYOUT, MEMBER, SHARD
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
 
+MANY_LANES = 512  # from which acting takes a good part of a CPU's time
 MAX_SKIPPED_IN_A_ROW = 20  # APG updates whose gradient is not finite, after which a run stops
 
 
@@ -341,7 +342,7 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
     return Trainer(
         setup,
         init=jax.jit(over_mesh(init, (P(MEMBER), P(MEMBER))), compiler_options=xla_effort(0)),  # it runs once
-        train=jax.jit(over_mesh(train, steps), donate_argnums=0, compiler_options=xla_effort(1)),
+        train=jax.jit(over_mesh(train, steps), donate_argnums=0, compiler_options=xla_effort(1, config.num_envs)),
         apg=jax.jit(over_mesh(apg, steps), donate_argnums=0, compiler_options=xla_effort(1)),
         fly=jax.jit(fly_padded, compiler_options=xla_effort(1)),
         gather=lambda tree: jax.tree.map(np.asarray, replicate(tree) if mesh else tree),
@@ -350,12 +351,12 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
     )
 
 
-def xla_effort(level: int) -> dict[str, Any]:
+def xla_effort(level: int, lanes: int = 0) -> dict[str, Any]:
     """Compiler options for an XLA optimization level on a CPU, where 1 compiles in two thirds of the default's time.
 
-    Without XLA's newer emitters of fused loops: compiling takes twice as long with them, the gradient of a flight 1.1
-    times (docs/profile.md).
+    With XLA's newer emitters of fused loops compiling takes twice as long and a step of many `lanes` four fifths; an
+    update no less, and the gradient of a flight more (docs/profile.md).
     """
     if jax.default_backend() != "cpu" or jax.config.read("jax_disable_most_optimizations"):
         return {}
-    return {"xla_backend_optimization_level": level, "xla_cpu_use_fusion_emitters": False}
+    return {"xla_backend_optimization_level": level, "xla_cpu_use_fusion_emitters": lanes >= MANY_LANES}
