@@ -108,11 +108,15 @@ def test_rewards_of_any_weights_are_the_papers(form: str, states: tuple[Body, Ar
     np.testing.assert_allclose(ours(form, w, *states), papers(form, w, *states), atol=1e-12)
 
 
-def test_near_cost_is_added_to_the_papers(states: tuple[Body, Array]) -> None:
-    """weight·d/(d + distance_m) of the distance d: half of the weight at `distance_m`."""
-    spec = task.load("hover").reward.model_copy(update={"near": task.Near(weight=0.4, distance_m=0.3)})
-    reward, plain = rewards.from_spec(spec), rewards.from_spec(task.load("hover").reward)
+@pytest.mark.parametrize("form", ["hover", "track"])
+def test_near_cost_is_added(form: str, states: tuple[Body, Array]) -> None:
+    """weight·d/(d + distance_m) of the distance d, half of the weight at `distance_m`; to track, of the rounded one."""
+    shipped = task.load(form).reward.model_copy(update={"near": None})
+    spec = shipped.model_copy(update={"near": task.Near(weight=0.4, distance_m=0.3)})
+    reward, plain = rewards.from_spec(spec), rewards.from_spec(shipped)
     (body, action), d = states, np.linalg.norm(states[0].pose.position_m, axis=1)
+    if form == "track":
+        d = np.sqrt(d**2 + shipped.rounding_m**2) - shipped.rounding_m
     added = jax.vmap(plain)(body, action) - jax.vmap(reward)(body, action)
     np.testing.assert_allclose(added, 0.4 * d / (d + 0.3), atol=1e-6)
 
