@@ -14,6 +14,7 @@ from qrl.config import Config, load_preset
 from qrl.runs import record
 from qrl.runs.record import RunConfig, TaskRecord
 from qrl.training import driver, loop
+from qrl.training.traced import Store
 from qrl.training.trainer import Trainer, make_trainer
 from qrl_envs import env as worlds
 
@@ -58,7 +59,9 @@ _programs: dict[Any, Any] = {}
 
 
 def _compiled_once(compile_program: Callable[..., Any]) -> Callable[..., Any]:
-    def program(trainer: Trainer, states: Any, inputs: Any) -> Any:
+    def program(trainer: Trainer, states: Any, inputs: Any, store: Store | None = None) -> Any:
+        if store:
+            return compile_program(trainer, states, inputs, store)
         key = compile_program, trainer, len(states.unrolls), jax.config.read("jax_disable_most_optimizations")
         if key not in _programs:
             _programs[key] = compile_program(trainer, states, inputs)
@@ -73,7 +76,13 @@ COMPILED_ONCE = {
 
 
 def train(
-    out: Path, run: RunConfig, env: Env, *, resume: bool = False, stop_after: int | None = None
+    out: Path,
+    run: RunConfig,
+    env: Env,
+    *,
+    resume: bool = False,
+    stop_after: int | None = None,
+    store: Store | None = None,
 ) -> list[loop.Event]:
     """Run to the end, or until `stop_after` events beyond compilation; runs of one environment share their programs."""
     for folder in record.member_folders(out, run):
@@ -86,7 +95,7 @@ def train(
         )
 
     with mock.patch.object(loop, "make_trainer", trainer_of), mock.patch.multiple(driver, **COMPILED_ONCE):
-        for event in loop.train(env, run, out, resume=resume, stopped=stopped):
+        for event in loop.train(env, run, out, resume=resume, stopped=stopped, store=store):
             seen.append(event)
     return seen
 

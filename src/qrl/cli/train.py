@@ -24,6 +24,7 @@ from qrl.runs import files, record
 from qrl.runs.files import Row
 from qrl.runs.record import RunConfig
 from qrl.training import devices, loop, multihost
+from qrl.training.traced import Store
 from qrl_envs.specfile import BadInput
 
 PICTURE_FLIGHTS = 5
@@ -127,7 +128,7 @@ def run(plan: Plan, stopped: Callable[[], bool]) -> loop.Finished | None:
     finished, start_time = None, time.perf_counter()
     with progress_bar(config.learner.num_unrolls * config.learner.steps_per_unroll) as update:
         for event in loop.train(
-            env, config, plan.out, resume=plan.exists, stopped=stopped, policy=_first_policy(config)
+            env, config, plan.out, resume=plan.exists, stopped=stopped, policy=_first_policy(config), store=Store.of_run(config)
         ):
             match event:
                 case loop.Compiling():

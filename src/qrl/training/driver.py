@@ -13,9 +13,10 @@ from qrl.algorithm.flights import Flights, summarize
 from qrl.algorithm.learner import LearnerState
 from qrl.config import Config
 from qrl.runs.files import Row
-from qrl.training import multihost
+from qrl.training import multihost, sharding, traced
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
-from qrl.training.trainer import Trainer
+from qrl.training.traced import Store
+from qrl.training.trainer import Trainer, xla_effort
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # target duration of one call of a compiled program
@@ -60,18 +61,43 @@ class Programs:
     gather: Callable[[Any], Any]
 
 
-def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
+def compile_init(trainer: Trainer, count: int, inputs: MemberInputs, store: Store | None = None) -> tuple[Any, Any]:
+    """Shapes and types of the states of so many members, and what makes them, compiled when it is first called."""
+    args: Any = seeds(0, count), inputs
+    if store is None:
+        return jax.eval_shape(trainer.init, *args), trainer.init
+    if everywhere := sharding.replicated(trainer.setup.mesh):
+        args = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), args)
+    program = traced.trace(store, "init", trainer.init.__wrapped__, args)
+    return program.result, lambda *given: program.compile(args, xla_effort(0), donated=False)(*given)
+
+
+def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
     """None for a run of APG alone."""
-    return None if trainer.config.all_apg else trainer.train.lower(states, inputs, np.int32(0)).compile()
+    if trainer.config.all_apg:
+        return None
+    effort = xla_effort(1, trainer.config.num_envs)
+    return _compiled("train", trainer.train, (states, inputs, np.int32(0)), store, effort, donated=True)
 
 
-def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
+def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
     """None for a run without APG."""
-    return trainer.apg.lower(states, inputs, np.int32(0)).compile() if trainer.config.num_apg_updates else None
+    if not trainer.config.num_apg_updates:
+        return None
+    return _compiled("apg", trainer.apg, (states, inputs, np.int32(0)), store, xla_effort(1), donated=True)
 
 
-def compile_fly(trainer: Trainer, states: TrainState, inputs: MemberInputs) -> Any:
-    return trainer.fly.lower(states.learner, inputs, report_starts(trainer.config)).compile()
+def compile_fly(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
+    args = states.learner, inputs, report_starts(trainer.config)
+    return _compiled("fly", trainer.fly, args, store, xla_effort(1), donated=False)
+
+
+def _compiled(
+    name: str, program: Any, args: tuple[Any, ...], store: Store | None, effort: dict[str, Any], donated: bool
+) -> Any:
+    if store is None:
+        return program.lower(*args).compile()
+    return traced.trace(store, name, program.__wrapped__, args).compile(args, effort, donated)
 
 
 def seeds(first: int, count: int) -> np.ndarray:

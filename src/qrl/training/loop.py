@@ -21,6 +21,7 @@ from qrl.runs.tensorboard import EventLog
 from qrl.training import driver, multihost, restore, sharding
 from qrl.training.driver import Chunk, Clock, NotFinite, Programs
 from qrl.training.state import TrainState, member_inputs, stack
+from qrl.training.traced import Store
 from qrl.training.trainer import Trainer, make_trainer
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
@@ -111,11 +112,12 @@ def train(
     resume: bool,
     stopped: Callable[[], bool],
     policy: Callable[[], tuple[Any, RunningStatistics]] | None = None,
+    store: Store | None = None,
 ) -> Iterator[Event]:
     """Train into the run folder(s) of `out`, from the last valid checkpoint if `resume`; yields what happens.
 
     `policy` gives the network's numbers that the run begins with, and the statistics of observations: by default
-    random numbers, and none.
+    random numbers, and none. `store` keeps traced programs, for `env` as the run describes it.
 
     Returns early, all saved, once `stopped()` is true. Raises NotFinite with the last good checkpoint kept. Of several
     processes only the coordinator reads and writes.
@@ -125,25 +127,25 @@ def train(
     inputs = stack([member_inputs(env, run.learner)] * run.seeds)
     folders = record.member_folders(out, run) if multihost.is_coordinator() else []
     configs = [run.member(i) for i in range(run.seeds)]
-    target = restore.abstract_states(trainer, inputs)
+    target, init = driver.compile_init(trainer, run.seeds, inputs, store)
     abstract = sharding.abstract_sharded(mesh, target)
     members: list[Member] = []
     executor = ThreadPoolExecutor()  # each compilation takes XLA seconds, and about one core
     try:
         yield Compiling()
-        compiled_train = executor.submit(driver.compile_train, trainer, abstract, inputs)
-        compiled_fly = executor.submit(driver.compile_fly, trainer, abstract, inputs)
+        compiled_train = executor.submit(driver.compile_train, trainer, abstract, inputs, store)
+        compiled_fly = executor.submit(driver.compile_fly, trainer, abstract, inputs, store)
         begin, states, clock, rows = 0, None, Clock(), [[] for _ in folders]
         if resume:
             begin, states, clock, rows, notes = _resume(trainer, folders, configs, target)
             yield Resumed(begin, notes)
         if states is None:
-            states = trainer.init(driver.seeds(run.seed, run.seeds), inputs)
+            states = init(driver.seeds(run.seed, run.seeds), inputs)
             states = _beginning_with(states, *policy()) if policy else states
         programs = Programs(
             train=compiled_train.result(),
             fly=compiled_fly.result(),
-            apg=executor.submit(driver.compile_apg, trainer, abstract, inputs).result,  # while training goes on
+            apg=executor.submit(driver.compile_apg, trainer, abstract, inputs, store).result,  # while training goes on
             gather=trainer.gather,
         )
         members = [Member(folder, configs[i], begin, rows[i]) for i, folder in enumerate(folders)]
