@@ -106,7 +106,9 @@ def physics(lanes: int, key: jax.Array) -> None:
     thrusts = params.physics.hover_thrust_N * factor
     if mesh:
         bodies, thrusts = jax.device_put((bodies, thrusts), NamedSharding(mesh, P(SHARD)))
-    step = partial(jax.jit(steps, compiler_options=xla_effort(1, lanes)), jax.tree.map(jnp.asarray, params.physics), thrusts)
+    step = partial(
+        jax.jit(steps, compiler_options=xla_effort(1, lanes)), jax.tree.map(jnp.asarray, params.physics), thrusts
+    )
     rate(f"physics, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
 
 

@@ -127,9 +127,8 @@ def run(plan: Plan, stopped: Callable[[], bool]) -> loop.Finished | None:
     env = tasks.environment(config.task)
     finished, start_time = None, time.perf_counter()
     with progress_bar(config.learner.num_unrolls * config.learner.steps_per_unroll) as update:
-        for event in loop.train(
-            env, config, plan.out, resume=plan.exists, stopped=stopped, policy=_first_policy(config), store=Store.of_run(config)
-        ):
+        first, store = _first_policy(config), Store.of_run(config)
+        for event in loop.train(env, config, plan.out, resume=plan.exists, stopped=stopped, policy=first, store=store):
             match event:
                 case loop.Compiling():
                     console.print("compiling")

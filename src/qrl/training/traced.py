@@ -23,6 +23,7 @@ from qrl.runs.record import RunConfig
 
 PACKAGES = ("qrl", "qrl_envs")
 LIBRARIES = ("jax", "jaxlib", "flax", "optax")
+DEBUG = ("jax_debug_nans", "jax_debug_infs", "jax_disable_jit")
 FORMAT = 1
 
 
@@ -37,16 +38,16 @@ class Store(NamedTuple):
         """That of a run's programs; None where they are not kept: of an environment whose source is not known here, of
         several processes, without a cache, or with settings of JAX that change how it traces.
         """
-        folder = jax.config.jax_compilation_cache_dir
-        debugs = jax.config.jax_debug_nans or jax.config.jax_disable_jit or jax.config.jax_debug_infs
+        settings = {name: str(getattr(jax.config, name, value)) for name, value in jax.config.values.items()}
+        folder = jax.config.values["jax_compilation_cache_dir"]
+        debugs = any(settings[name] == "True" for name in DEBUG)
         if not folder or run.task.spec is None or jax.process_count() > 1 or debugs:
             return None
-        settings = {name: str(value) for name, value in jax.config.values.items() if not name.endswith("_dir")}
         made_of = {
             "format": FORMAT,
             "sources": _sources(),
             "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
-            "jax": settings,
+            "jax": {name: value for name, value in settings.items() if not name.endswith("_dir")},
             "flags": os.environ.get("XLA_FLAGS", ""),
             "devices": [f"{device.platform} {device.device_kind}" for device in jax.devices()],
             "run": run.model_dump(mode="json", include={"task", "learner", "seeds"}),
@@ -124,8 +125,9 @@ def _described(tree: Any) -> Any:
     parts: Any
     if isinstance(tree, dict):
         return {"dict": {key: _described(x) for key, x in tree.items()}}
-    if hasattr(tree, "_fields") or dataclasses.is_dataclass(tree):
-        names = tree._fields if hasattr(tree, "_fields") else [field.name for field in dataclasses.fields(tree)]
+    fields: Any = getattr(tree, "_fields", None)
+    if fields is not None or dataclasses.is_dataclass(tree):
+        names = [field.name for field in dataclasses.fields(tree)] if fields is None else fields
         parts = {name: _described(getattr(tree, name)) for name in names}
         return {"type": [type(tree).__module__, type(tree).__qualname__], "parts": parts}
     if isinstance(tree, list | tuple):
