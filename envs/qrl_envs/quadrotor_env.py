@@ -1,7 +1,7 @@
 """The tasks of a vehicle as environments: of an ideal plant, and of a real one."""
 
 import copy
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -87,6 +87,28 @@ class QuadrotorEnv(TaskEnv):
         return Evaluation(env, round(spec.duration_s / dt_s), round(spec.return_s / dt_s), measure)
 
 
+class Observed(NamedTuple):
+    """How many numbers of each kind the environment of a real vehicle observes, in their order."""
+
+    body: int
+    preview: int
+    previous_action: int
+    integral: int
+    critic: int  # what a policy does not see
+
+
+def observed(task: QuadrotorTask) -> Observed:
+    """Of a task of a real vehicle; no array is made, so JAX need not have its devices yet."""
+    motors, integrator = len(task.vehicle.motors), plant.integrator(task)
+    return Observed(
+        body=18,
+        preview=3 * len(task.preview_s),
+        previous_action=motors * task.memory.previous_action,
+        integral=integrator.size if integrator else 0,
+        critic=plant.PRIVILEGED + motors,
+    )
+
+
 class RealQuadrotorEnv(QuadrotorEnv):
     """A task of a multirotor whose rotors lag, on a plant that is drawn anew for each flight (`plant`).
 
@@ -109,10 +131,9 @@ class RealQuadrotorEnv(QuadrotorEnv):
         self._integrator = plant.integrator(task)
         self._reference = self._followed(task.reference, task.episode_s, anywhere=True)
         self._calibrating = False
-        motors, integrals = len(task.vehicle.motors), self._integrator.size if self._integrator else 0
-        ahead = 3 * len(task.preview_s)
-        self.policy_observation_size = 18 + ahead + task.memory.previous_action * motors + integrals
-        self._sizes = self.policy_observation_size + plant.PRIVILEGED + motors, motors
+        parts = observed(task)
+        self.policy_observation_size = sum(parts[:-1])
+        self._sizes = sum(parts), len(task.vehicle.motors)
         self._layout = (shaped_for or uncertainty).layout(task.control_period_s)
 
     def _followed(self, spec: Reference | None, flight_s: float, anywhere: bool) -> Figure | Motion | None:

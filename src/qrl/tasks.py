@@ -20,6 +20,7 @@ from qrl.runs.record import RunConfig, TaskRecord, with_current_names
 from qrl_envs import env as worlds
 from qrl_envs import specfile
 from qrl_envs import task as task_spec
+from qrl_envs.quadrotor_env import observed
 from qrl_envs.reference import reference_data
 from qrl_envs.specfile import BadInput
 from qrl_envs.uncertainty import uncertainty_data
@@ -277,13 +278,9 @@ PREVIEW_SCALE_S_M = 0.5
 
 def _other_scales(task: task_spec.QuadrotorTask) -> list[float]:
     """Scales of what an environment of a real vehicle observes beside the 18 numbers of the paper's."""
-    env = worlds.from_task(task)
-    motors = len(task.vehicle.motors) * task.memory.previous_action
-    ahead = 3 * len(task.preview_s)
-    seen = env.policy_observation_size or 18
-    integrals = seen - 18 - ahead - motors
-    critic = env.observation_size - seen
-    return [PREVIEW_SCALE_S_M] * ahead + [1.0] * motors + [INTEGRAL_SCALE_1_M_S] * integrals + [1.0] * critic
+    of = observed(task)
+    known = [PREVIEW_SCALE_S_M] * of.preview + [1.0] * of.previous_action + [INTEGRAL_SCALE_1_M_S] * of.integral
+    return known + [1.0] * of.critic
 
 
 def check(env: Env, learner: Config, where: str) -> None:
