@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qrl.algorithm.analytic_gradient import _constant_leaves
+from qrl.algorithm.carried import Carried
 from qrl_envs import task
 from qrl_envs.env import from_task
 from qrl_envs.quadrotor_env import RealQuadrotorEnv
@@ -67,7 +67,10 @@ def test_parameters_and_a_flights_world_are_constant() -> None:
     world = from_task(task.load("hover", "crazyflie"))
     assert isinstance(world, RealQuadrotorEnv)
     states = jax.jit(jax.vmap(world.reset, out_axes=-1))(jax.random.split(jax.random.PRNGKey(0), 3))
-    constant = _constant_leaves(world, states, jnp.zeros((4, 3))).pipeline_state
-    assert all(jax.tree.leaves(constant.params))
-    assert all(jax.tree.leaves(constant.x.world))
-    assert not any(jax.tree.leaves((constant.x.body, constant.x.speed, constant.x.integral_m_s)))
+    carried = Carried(world.step_lanes, states, jnp.zeros((4, 3)), lambda state: (state.obs, state.reward, state.done))
+    moved = jax.tree.map(lambda x: x + 1, states)
+    lane, first, later = (x.pipeline_state for x in (carried.unpack(carried.pack(moved)), states, moved))
+    for ours, expected in ((lane.params, first.params), (lane.x.world, first.x.world)):
+        assert all(x is y for x, y in zip(jax.tree.leaves(ours), jax.tree.leaves(expected), strict=True))
+    for name in ("body", "speed", "integral_m_s"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(lane.x, name), getattr(later.x, name))
