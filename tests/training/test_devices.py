@@ -171,3 +171,17 @@ def test_a_seed_of_several_is_repeated_as_it_was_trained() -> None:
     for seeds, there, each in ((2, 4, 2), (4, 4, 1), (3, 2, 2), (1, 2, 2), (2, 1, 1), (2, 0, 0)):
         both = run().model_copy(update={"seeds": seeds, "devices": devices[:there]})
         assert both.member(0).devices == devices[:each]
+
+
+@pytest.mark.parametrize("task", ["any", "hover"])
+def test_a_run_is_planned_before_jax_has_its_devices(task: str) -> None:
+    """Else it would have one, whatever `cpu_devices` says: JAX refuses another number once it has made them."""
+    plan = (
+        "import jax; from qrl import request; from qrl.runs.record import ConfigFile;"
+        f"request.run_config({task!r}, None, ConfigFile(), {{}}, 0, 1, {{'vehicle': 'crazyflie'}});"
+        "jax.config.update('jax_num_cpu_devices', 2); print(len(jax.devices()))"
+    )
+    unset = {"JAX_NUM_CPU_DEVICES", "XLA_FLAGS"}
+    env = {name: value for name, value in os.environ.items() if name not in unset}
+    done = subprocess.run([sys.executable, "-c", plan], env=env, capture_output=True, text=True, check=False)
+    assert done.stdout == "2\n", done.stderr
