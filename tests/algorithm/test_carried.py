@@ -43,6 +43,14 @@ def test_a_loop_carries_what_a_later_step_needs_and_no_more() -> None:
     assert carried.unpack(packed)["seen"] is first["seen"]
 
 
+def test_a_step_that_gives_other_states_is_refused() -> None:
+    def renames(state: dict[str, Any], action: jax.Array) -> dict[str, Any]:
+        return {"z" if name == "x" else name: value for name, value in step(state, action).items()}
+
+    with pytest.raises(ValueError, match="expected a step to give states like"):
+        Carried(renames, states(), jnp.ones((2, LANES)), lambda state: list(state.values())[0])
+
+
 @pytest.mark.parametrize("task", ["any", "hover", "pendulum"])
 def test_flights_of_what_is_carried_are_those_of_whole_states(task: str) -> None:
     """Of a task that ships: reward, end and observation at each step, whatever else its state has."""

@@ -193,9 +193,11 @@ def test_what_is_observed_is_relative_to_the_reference() -> None:
     weights = env.task.reward
     assert isinstance(weights, task.TrackReward)
     action = np.asarray(later.previous_action)
+    distance = np.sqrt(np.sum((p - then.position_m) ** 2) + weights.rounding_m**2) - weights.rounding_m
+    assert weights.near
     wanted = -(
-        weights.w_position_1_m
-        * (np.sqrt(np.sum((p - then.position_m) ** 2) + weights.rounding_m**2) - weights.rounding_m)
+        weights.w_position_1_m * distance
+        + weights.near.weight * distance / (distance + weights.near.distance_m)
         + weights.w_velocity_s_m * np.linalg.norm(w - then.velocity_m_s)
         + weights.w_body_rate_s2_rad2 * np.sum(omega**2)
         + weights.w_heading * q[3] ** 2 / (q[0] ** 2 + q[3] ** 2 + 1e-3)

@@ -21,11 +21,17 @@ class Carried:
     """
 
     def __init__(self, step: Callable[[Any, chex.Array], Any], states: Any, action: chex.Array, wanted: Wanted) -> None:
-        """Of step(states, actions) -> states; `states` are those of the first step."""
+        """Of step(states, actions) -> states; `states` are those of the first step.
+
+        Raises ValueError for a step whose states have another structure.
+        """
         self._leaves, self._structure = jax.tree.flatten(states)
         self._dtype = jax.tree.leaves(wanted(states))[0].dtype
         places = jax.tree.unflatten(self._structure, list(range(len(self._leaves))))
-        program = jax.make_jaxpr(step)(states, action).jaxpr
+        closed, after = jax.make_jaxpr(step, return_shape=True)(states, action)
+        if (found := jax.tree.structure(after)) != self._structure:
+            raise ValueError(f"expected a step to give states like {self._structure}, found {found}")
+        program = closed.jaxpr
         inputs = program.invars[: len(self._leaves)]
         needed = _needed(program, set(jax.tree.leaves(wanted(places))), len(inputs))
         self._at = [i for i in sorted(needed) if program.outvars[i] is not inputs[i]]

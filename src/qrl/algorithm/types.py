@@ -73,7 +73,10 @@ class TaskEnv(Env, Protocol):
     @property
     def params(self) -> Any: ...  # pytree of arrays that sweeps may vary; () for none
     @property
-    def policy_observation_size(self) -> int | None: ...  # a policy sees this many numbers, the first; None: all
+    def policy_observation_size(self) -> int | None:
+        """A policy sees this many numbers, the first; None: all. In APG `step` is given these alone, too."""
+        ...
+
     def policy_view(self, observation: chex.Array) -> chex.Array: ...  # a policy network's input, of what it sees
     @property
     def episode_steps(self) -> int: ...  # maximum length of an episode

@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 from rich.console import Console
 
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
+STARTED = time.time() - 5.0  # s since the epoch: no module was read before
 
 console = Console(highlight=False, markup=False, soft_wrap=True)
 

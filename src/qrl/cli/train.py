@@ -16,7 +16,17 @@ import numpy as np
 
 from qrl import request, tasks
 from qrl.algorithm.running_statistics import RunningStatistics
-from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, clock, console, print_error, progress_bar, stop_requested
+from qrl.cli.terminal import (
+    DONE,
+    FAILED,
+    STARTED,
+    WRONG_INPUT,
+    clock,
+    console,
+    print_error,
+    progress_bar,
+    stop_requested,
+)
 from qrl.cli.verdict import FLIES, verdict
 from qrl.config import Config
 from qrl.evaluation import initial
@@ -28,6 +38,7 @@ from qrl.training.traced import Store
 from qrl_envs.specfile import BadInput
 
 PICTURE_FLIGHTS = 5
+FORMER_NORM = 8.0  # up to which a bound on gradients is likely one of the mean's, as it was
 _HEADER = f"{'steps':>12} {'steps/s':>10} {'return':>20} {'success':>16} {'train time':>10} {'ETA':>6}"
 
 
@@ -101,6 +112,11 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
         config = config.model_copy(update={"devices": devices.device_names()})
     elif changed := request.changed_since(config):
         console.print(f"environment changed since the run began; results may not be bit-identical: {changed}")
+    if (norm := config.learner.apg_cotangent_norm) is not None and norm <= FORMER_NORM:
+        each = f"times apg_num_envs, {norm * config.learner.apg_num_envs:g}"
+        print_error(
+            f"warning: apg_cotangent_norm {norm:g}: of one flight's gradient; a number of before is that {each}"
+        )
     for warning in tasks.spec(config.task).warnings() if config.task.spec else []:
         print_error(f"warning: {config.task.name}: {warning}")
     given = {"observation_scale", "observation_limit"} & {*flags}
@@ -127,7 +143,7 @@ def run(plan: Plan, stopped: Callable[[], bool]) -> loop.Finished | None:
     env = tasks.environment(config.task)
     finished, start_time = None, time.perf_counter()
     with progress_bar(config.learner.num_unrolls * config.learner.steps_per_unroll) as update:
-        first, store = _first_policy(config), Store.of_run(config)
+        first, store = _first_policy(config), Store.of_run(config, STARTED)
         for event in loop.train(env, config, plan.out, resume=plan.exists, stopped=stopped, policy=first, store=store):
             match event:
                 case loop.Compiling():

@@ -16,7 +16,7 @@ from qrl.runs.files import Row
 from qrl.training import multihost, sharding, traced
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
 from qrl.training.traced import Store
-from qrl.training.trainer import Trainer, xla_effort
+from qrl.training.trainer import DONATED, Trainer
 
 REPORT_STARTS_SEED = 20_061_122  # the fixed starts of every report of every run
 CHUNK_SECONDS = 1.0  # target duration of one call of a compiled program
@@ -64,40 +64,34 @@ class Programs:
 def compile_init(trainer: Trainer, count: int, inputs: MemberInputs, store: Store | None = None) -> tuple[Any, Any]:
     """Shapes and types of the states of so many members, and what makes them, compiled when it is first called."""
     args: Any = seeds(0, count), inputs
-    if store is None:
-        return jax.eval_shape(trainer.init, *args), trainer.init
     if everywhere := sharding.replicated(trainer.setup.mesh):
         args = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), args)
-    program = traced.trace(store, "init", trainer.init.__wrapped__, args)
-    return program.result, lambda *given: program.compile(args, xla_effort(0), donated=False)(*given)
+    program = traced.trace(store, "init", trainer.init.__wrapped__, args) if store else None
+    if program is None:
+        return jax.eval_shape(trainer.init, seeds(0, count), inputs), trainer.init
+    return program.result, lambda *given: program.compile(args, trainer.effort("init"))(*given)
 
 
 def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
     """None for a run of APG alone."""
-    if trainer.config.all_apg:
-        return None
-    effort = xla_effort(1, trainer.config.num_envs)
-    return _compiled("train", trainer.train, (states, inputs, np.int32(0)), store, effort, donated=True)
+    return None if trainer.config.all_apg else _compiled(trainer, "train", (states, inputs, np.int32(0)), store)
 
 
 def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
     """None for a run without APG."""
-    if not trainer.config.num_apg_updates:
-        return None
-    return _compiled("apg", trainer.apg, (states, inputs, np.int32(0)), store, xla_effort(1), donated=True)
+    return _compiled(trainer, "apg", (states, inputs, np.int32(0)), store) if trainer.config.num_apg_updates else None
 
 
 def compile_fly(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
-    args = states.learner, inputs, report_starts(trainer.config)
-    return _compiled("fly", trainer.fly, args, store, xla_effort(1), donated=False)
+    return _compiled(trainer, "fly", (states.learner, inputs, report_starts(trainer.config)), store)
 
 
-def _compiled(
-    name: str, program: Any, args: tuple[Any, ...], store: Store | None, effort: dict[str, Any], donated: bool
-) -> Any:
-    if store is None:
-        return program.lower(*args).compile()
-    return traced.trace(store, name, program.__wrapped__, args).compile(args, effort, donated)
+def _compiled(trainer: Trainer, name: str, args: tuple[Any, ...], store: Store | None) -> Any:
+    jitted = getattr(trainer, name)
+    program = traced.trace(store, name, jitted.__wrapped__, args) if store else None
+    if program is None:
+        return jitted.lower(*args).compile()
+    return program.compile(args, trainer.effort(name), DONATED.get(name))
 
 
 def seeds(first: int, count: int) -> np.ndarray:

@@ -11,6 +11,8 @@ import importlib.metadata
 import importlib.util
 import json
 import os
+import sys
+import tempfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +24,7 @@ from jax import export
 from qrl.runs.record import RunConfig
 
 PACKAGES = ("qrl", "qrl_envs")
-LIBRARIES = ("jax", "jaxlib", "flax", "optax")
+LIBRARIES = ("jax", "jaxlib", "flax", "optax", "chex", "numpy", "pydantic")
 DEBUG = ("jax_debug_nans", "jax_debug_infs", "jax_disable_jit")
 FORMAT = 1
 
@@ -34,18 +36,24 @@ class Store(NamedTuple):
     of: str  # fingerprint of what else a program is made of
 
     @classmethod
-    def of_run(cls, run: RunConfig) -> "Store | None":
-        """That of a run's programs; None where they are not kept: of an environment whose source is not known here, of
-        several processes, without a cache, or with settings of JAX that change how it traces.
+    def of_run(cls, run: RunConfig, since: float) -> "Store | None":
+        """That of a run's programs, in a process that began at `since` [s since the epoch]; None where none is kept.
+
+        That is: of an environment whose source is not known here, or was edited since, so that it may not be what this
+        process has read; of several processes; without a cache on disk; with settings of JAX that change how it traces.
         """
         settings = {name: str(getattr(jax.config, name, value)) for name, value in jax.config.values.items()}
         folder = jax.config.values["jax_compilation_cache_dir"]
-        debugs = any(settings[name] == "True" for name in DEBUG)
-        if not folder or run.task.spec is None or jax.process_count() > 1 or debugs:
+        off = settings["jax_enable_compilation_cache"] != "True" or any(settings[name] == "True" for name in DEBUG)
+        if off or not folder or "://" in folder or run.task.spec is None or jax.process_count() > 1:
+            return None
+        sources = Sources.read()
+        if sources.edited > since:
             return None
         made_of = {
             "format": FORMAT,
-            "sources": _sources(),
+            "sources": sources.digest,
+            "python": sys.version,
             "libraries": {name: importlib.metadata.version(name) for name in LIBRARIES},
             "jax": {name: value for name, value in settings.items() if not name.endswith("_dir")},
             "flags": os.environ.get("XLA_FLAGS", ""),
@@ -67,18 +75,20 @@ class Program(NamedTuple):
         like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.exported.out_avals]
         return jax.tree.unflatten(self.structure, like)
 
-    def compile(self, args: tuple[Any, ...], options: dict[str, Any], donated: bool) -> Callable[..., Any]:
-        """Compiled for arguments like `args`; with `donated` the first is given away."""
-        first = len(jax.tree.leaves(args[0])) if donated else 0
-        jitted = jax.jit(self.exported.call, donate_argnums=tuple(range(first)), compiler_options=options)
+    def compile(self, args: tuple[Any, ...], options: dict[str, Any], donated: int | None = None) -> Callable[..., Any]:
+        """Compiled for arguments like `args`; the one at `donated` may be overwritten."""
+        sizes = [len(jax.tree.leaves(x)) for x in args]
+        first = sum(sizes[:donated])
+        given = () if donated is None else tuple(range(first, first + sizes[donated]))
+        jitted = jax.jit(self.exported.call, donate_argnums=given, compiler_options=options)
         compiled = jitted.lower(*jax.tree.leaves(args)).compile()
         return lambda *args: jax.tree.unflatten(self.structure, compiled(*jax.tree.leaves(args)))
 
 
-def trace(store: Store, name: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Program:
-    """The program of function(*args), from the store or for it."""
+def trace(store: Store, name: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Program | None:
+    """The program of function(*args), from the store or for it; None if it cannot be kept, as with a callback in it."""
     leaves, tree = jax.tree.flatten(args)
-    like = [str(jax.typeof(x) if not isinstance(x, jax.ShapeDtypeStruct) else x) for x in leaves]
+    like = [str(x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)) for x in leaves]
     key = hashlib.sha256("\n".join([store.of, name, str(tree), *like]).encode()).hexdigest()
     path = store.folder / f"qrl-{name}-{key}"
     if found := _read(path):
@@ -90,34 +100,38 @@ def trace(store: Store, name: str, function: Callable[..., Any], args: tuple[Any
         structure.append(of_result)
         return result
 
-    program = Program(export.export(jax.jit(flat))(*leaves), structure[-1])
-    described = _described(jax.tree.unflatten(program.structure, range(program.structure.num_leaves)))
-    if jax.tree.structure(_built(described)) == program.structure:
+    try:
+        program = Program(export.export(jax.jit(flat))(*leaves), structure[-1])
+        described = _described(jax.tree.unflatten(program.structure, range(program.structure.num_leaves)))
+        if jax.tree.structure(_built(described)) != program.structure:
+            return None
         content = json.dumps(described).encode() + b"\n" + program.exported.serialize()
-        _write(path, hashlib.sha256(content).digest() + content)
+    except Exception:  # whatever JAX says of what it cannot write down, the program itself may well run
+        return None
+    _write(path, hashlib.sha256(content).digest() + content)
     return program
 
 
 def _write(path: Path, data: bytes) -> None:
     """Atomically; a full disk costs a command its time, not its run."""
-    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(data)
-        temporary.replace(path)
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix="qrl-", suffix=".tmp", delete=False) as file:
+            file.write(data)
+        Path(file.name).replace(path)
 
 
 def _read(path: Path) -> Program | None:
-    """What was kept at `path`; None if that is nothing, or not what was written."""
+    """What was kept at `path`; None if that is nothing, or cannot be read."""
     try:
         data = path.read_bytes()
-    except OSError:
+        digest, content = data[:32], data[32:]
+        if hashlib.sha256(content).digest() != digest:
+            return None
+        described, exported = content.split(b"\n", 1)
+        return Program(export.deserialize(bytearray(exported)), jax.tree.structure(_built(json.loads(described))))
+    except Exception:  # of another version of JAX, say
         return None
-    digest, content = data[:32], data[32:]
-    if hashlib.sha256(content).digest() != digest:
-        return None
-    described, exported = content.split(b"\n", 1)
-    return Program(export.deserialize(bytearray(exported)), jax.tree.structure(_built(json.loads(described))))
 
 
 def _described(tree: Any) -> Any:
@@ -149,14 +163,21 @@ def _built(described: Any) -> Any:
     return {"list": list, "tuple": tuple}[kind](map(_built, parts))
 
 
-def _sources() -> str:
-    """Fingerprint of the source and data files of qrl and its worlds."""
-    digest = hashlib.sha256()
-    for package in PACKAGES:
-        found = importlib.util.find_spec(package)
-        for folder in (found.submodule_search_locations or []) if found else []:
-            for path in sorted(Path(folder).rglob("*")):
-                if path.suffix in (".py", ".json", ".csv"):
-                    digest.update(f"{path.relative_to(folder)}\0".encode())
-                    digest.update(path.read_bytes())
-    return digest.hexdigest()
+class Sources(NamedTuple):
+    """The source and data files of qrl and its worlds."""
+
+    digest: str
+    edited: float  # when the last of them was, in seconds since the epoch
+
+    @classmethod
+    def read(cls) -> "Sources":
+        digest, edited = hashlib.sha256(), 0.0
+        for package in PACKAGES:
+            found = importlib.util.find_spec(package)
+            for folder in (found.submodule_search_locations or []) if found else []:
+                for path in sorted(Path(folder).rglob("*")):
+                    if path.suffix in (".py", ".json", ".csv"):
+                        digest.update(f"{path.relative_to(folder)}\0".encode())
+                        digest.update(path.read_bytes())
+                        edited = max(edited, path.stat().st_mtime)
+        return cls(digest.hexdigest(), edited)

@@ -27,6 +27,7 @@ from qrl.training.sharding import LAYOUT, MEMBER, SHARD
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
 
 MANY_LANES = 512  # from which acting takes a good part of a CPU's time
+DONATED = {"train": 0, "apg": 0}  # by program, the argument that it may overwrite
 MAX_SKIPPED_IN_A_ROW = 20  # APG updates whose gradient is not finite, after which a run stops
 
 
@@ -285,6 +286,7 @@ class Trainer(NamedTuple):
     train: Any
     apg: Any
     fly: Any
+    effort: Callable[[str], dict[str, Any]]  # compiler options of a program, by its name
     gather: Callable[[Any], Any]  # values of the programs -> NumPy, from all devices and processes
     member: Callable[[TrainState, int], TrainState]  # one member's state in NumPy, a copy
 
@@ -339,12 +341,21 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
     replicate = jax.jit(lambda tree: tree, out_shardings=everywhere)
     one_member = jax.jit(lambda states, i: jax.tree.map(lambda x: x[i], states), out_shardings=everywhere)
     steps = (LAYOUT, P(MEMBER), P())
+
+    def effort(name: str) -> dict[str, Any]:
+        # `init` runs once.
+        return xla_effort(0 if name == "init" else 1, config.num_envs if name == "train" else 0)
+
+    def jitted(name: str, program: Callable[..., Any]) -> Any:
+        return jax.jit(program, donate_argnums=DONATED.get(name, ()), compiler_options=effort(name))
+
     return Trainer(
         setup,
-        init=jax.jit(over_mesh(init, (P(MEMBER), P(MEMBER))), compiler_options=xla_effort(0)),  # it runs once
-        train=jax.jit(over_mesh(train, steps), donate_argnums=0, compiler_options=xla_effort(1, config.num_envs)),
-        apg=jax.jit(over_mesh(apg, steps), donate_argnums=0, compiler_options=xla_effort(1)),
-        fly=jax.jit(fly_padded, compiler_options=xla_effort(1)),
+        init=jitted("init", over_mesh(init, (P(MEMBER), P(MEMBER)))),
+        train=jitted("train", over_mesh(train, steps)),
+        apg=jitted("apg", over_mesh(apg, steps)),
+        fly=jitted("fly", fly_padded),
+        effort=effort,
         gather=lambda tree: jax.tree.map(np.asarray, replicate(tree) if mesh else tree),
         # A copy: a live view of a device array would cancel its donation.
         member=lambda states, i: jax.tree.map(np.asarray, one_member(states, i)),
