@@ -48,7 +48,7 @@ def test_a_step_that_gives_other_states_is_refused() -> None:
         return {"z" if name == "x" else name: value for name, value in step(state, action).items()}
 
     with pytest.raises(ValueError, match="expected a step to give states like"):
-        Carried(renames, states(), jnp.ones((2, LANES)), lambda state: list(state.values())[0])
+        Carried(renames, states(), jnp.ones((2, LANES)), lambda state: next(iter(state.values())))
 
 
 @pytest.mark.parametrize("task", ["any", "hover", "pendulum"])
