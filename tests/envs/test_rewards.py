@@ -115,7 +115,7 @@ def test_near_cost_is_added(form: str, states: tuple[Body, Array]) -> None:
     spec = shipped.model_copy(update={"near": task.Near(weight=0.4, distance_m=0.3)})
     reward, plain = rewards.from_spec(spec), rewards.from_spec(shipped)
     (body, action), d = states, np.linalg.norm(states[0].pose.position_m, axis=1)
-    if form == "track":
+    if isinstance(shipped, task.TrackReward):
         d = np.sqrt(d**2 + shipped.rounding_m**2) - shipped.rounding_m
     added = jax.vmap(plain)(body, action) - jax.vmap(reward)(body, action)
     np.testing.assert_allclose(added, 0.4 * d / (d + 0.3), atol=1e-6)
