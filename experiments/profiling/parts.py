@@ -123,11 +123,9 @@ def act_policy(trainer: Trainer, call: Call) -> Any:
 
 
 def draw_noise(trainer: Trainer, call: Call) -> Any:
-    key, shape = (
-        jax.random.fold_in(call.inputs.state.key, call.i),
-        (trainer.config.unroll_length, trainer.setup.env.action_size),
-    )
-    return jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(key, n), shape))(call.inputs.state.lanes.lane_id)
+    key = jax.random.fold_in(call.inputs.state.key, call.i)
+    lanes, size = call.inputs.state.lanes.lane_id, trainer.setup.env.action_size
+    return rollout.normal(key, lanes, trainer.config.unroll_length, size)
 
 
 def step_physics(trainer: Trainer, call: Call) -> Any:
@@ -176,7 +174,7 @@ def gather(trainer: Trainer, call: Call) -> Any:
 
 def augment(trainer: Trainer, call: Call) -> Any:
     after = augmentation.augment(trainer.setup.env, call.inputs.batch, call.inputs.symmetries[call.i])
-    return after.observation + call.tiny, after.next_observation + call.tiny, after.action + call.tiny
+    return after.observation + call.tiny, after.final_observation + call.tiny, after.action + call.tiny
 
 
 # -- update --------------------------------------------------------------------------------------------------

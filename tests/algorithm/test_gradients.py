@@ -81,17 +81,16 @@ WHY = ("terminated", "truncated", "out of bounds", "all")
 
 
 def batch(where: Array, why: str, seed: int = 0) -> Transition:
-    """Trajectories [B, T] that end `where`; what follows a step is what precedes the next one, but at an end."""
+    """Trajectories [B, T] that end `where`, with final observations of their own."""
     rng = np.random.default_rng(seed)
     count, steps = where.shape
     kind = np.cumsum(where).reshape(where.shape) % 3 if why == "all" else np.full(where.shape, WHY.index(why))
-    observation = rng.normal(size=(count, steps + 1, F))
     return Transition(
-        observation=observation[:, :-1],
+        observation=rng.normal(size=(count, steps, F)),
         action=0.8 * rng.normal(size=(count, steps, A)),
         log_mu=np.zeros(where.shape),
         reward=rng.normal(size=where.shape) - 0.3,
-        next_observation=np.where(where[..., None], rng.normal(size=(count, steps, F)), observation[:, 1:]),
+        final_observation=rng.normal(size=(count, 2, F)),
         terminated=1.0 * (where & (kind == 0)),
         truncated=1.0 * (where & (kind > 0)),
         out_of_bounds=1.0 * (where & (kind == 2)),
@@ -132,6 +131,21 @@ def log_pi(hyper: Hyperparameters, progress: float, policy: Any, d: Transition) 
     return (-(z**2) / 2 - jnp.log(sigma * np.sqrt(2 * np.pi))).sum(-1)
 
 
+def next_observations(d: Transition) -> Array:
+    """[B, T, F] what V is bootstrapped from after each step: the next step's own, but the final observations at the
+    last step and at the first truncation within bounds before it; at further ones, the observation before the step.
+    """
+    after = np.roll(d.observation, -1, axis=1)
+    for b in range(len(after)):
+        cut = [i for i in range(after.shape[1] - 1) if d.truncated[b, i] and not d.out_of_bounds[b, i]]
+        for i in cut[1:]:
+            after[b, i] = d.observation[b, i]
+        if cut:
+            after[b, cut[0]] = d.final_observation[b, 0]
+        after[b, -1] = d.final_observation[b, 1]
+    return after
+
+
 class Constants(NamedTuple):
     advantage: Array  # [B, T]
     target: Array  # [B, T]
@@ -142,7 +156,8 @@ def constants(learner: BoundLearner, progress: float, params: Networks, d: Trans
     c, hyper = learner.config, jax.tree.map(float, learner.hyper._replace(observation_scale=None))
     scale, horizon = learner.hyper.observation_scale, 1.0 / (1.0 - hyper.gamma)
     low, high = (hyper.reward_scaling * horizon * x for x in (min(d.reward.min(), 0.0), max(d.reward.max(), 0.0)))
-    v, v_next = (np.clip(mlp(params.critic, x * scale)[..., 0], low, high) for x in (d.observation, d.next_observation))
+    states = (d.observation, next_observations(d))
+    v, v_next = (np.clip(mlp(params.critic, x * scale)[..., 0], low, high) for x in states)
     ratio = np.exp(log_pi(learner.hyper, progress, params.policy, d) - d.log_mu)
     off_policy = c.advantage == "pi"
     advantage, target = np.zeros(d.reward.shape), np.zeros(d.reward.shape)

@@ -26,7 +26,7 @@ def ends_at(*steps: int) -> np.ndarray:
     return np.arange(T) == np.asarray(steps)[:, None]
 
 
-# Where trajectories end: at more steps than one (V of all that follows is computed anew) or at fewer.
+# Where trajectories end: at more steps than one, at one or at none before the last.
 ENDS = {
     "ends within": random_ends(),
     "one end within": ends_at(0, T - 2, 3),
@@ -36,18 +36,17 @@ ENDS = {
 
 
 def batch(seed: int = 0, ended: np.ndarray = ENDS["ends within"]) -> Transition:
-    """Trajectories: what follows a step is what precedes the next one, but at an end."""
+    """Trajectories, with final observations of their own."""
     rng = np.random.default_rng(seed)
     count, steps = ended.shape
     terminated = ended & (np.cumsum(ended).reshape(ended.shape) % 3 == 0)
     truncated = ended & ~terminated
-    observation = rng.normal(size=(count, steps + 1, F))
     values = Transition(
-        observation=observation[:, :-1],
+        observation=rng.normal(size=(count, steps, F)),
         action=rng.normal(size=(count, steps, A)),
         log_mu=rng.normal(size=ended.shape) - 2.0,
         reward=rng.normal(size=ended.shape),
-        next_observation=np.where(ended[..., None], rng.normal(size=(count, steps, F)), observation[:, 1:]),
+        final_observation=rng.normal(size=(count, 2, F)),
         terminated=terminated,
         truncated=truncated,
         out_of_bounds=truncated & (np.cumsum(truncated) % 3 == 2).reshape(ended.shape),
@@ -66,7 +65,7 @@ def losses(learner: BoundLearner, data: Transition) -> tuple[float, float]:
 
 
 def test_members_side_by_side_have_their_own_ends() -> None:
-    """Under vmap, as on a GPU, a member whose V is computed anew throughout changes no other."""
+    """Under vmap, as on a GPU, a member changes no other."""
     learner = BoundLearner(config(), F, A)
     each = [batch(0, ENDS["ends within"]), batch(1, ENDS["one end within"])]
     state = begin(learner, each[0])

@@ -1,6 +1,8 @@
 """The rollout against a literal loop over one lane's steps, on a toy whose observation is its whole state."""
 
 import functools
+import itertools
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -91,7 +93,13 @@ class Flight(NamedTuple):
     env: Fenced
     begun: Lanes
     ended: Lanes
-    steps: Transition  # [N, UNROLLS·T, ...] NumPy
+    steps: Transition  # [N, UNROLLS·T, ...] NumPy; of the final observations [N, UNROLLS·2, ...]
+
+    @property
+    def after(self) -> Array:
+        """[N, UNROLLS·T, 5] the observation after each step, before any reset, by the environment itself."""
+        each = jax.vmap(jax.vmap(lambda x, a: self.env.step(self.env.at(x), jnp.clip(a, -1.0, 1.0)).obs))
+        return np.asarray(each(self.steps.observation, self.steps.action))
 
 
 @functools.cache
@@ -175,7 +183,6 @@ def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
             age += 1
             terminated = bool(state.done) and not bool(state.info.get(getattr(flight.env, "mark", ""), 0.0))
             truncated = not terminated and (bool(state.done) or age == LONGEST)
-            np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-5, atol=1e-6)
             np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-5, atol=1e-5)
             assert (steps.terminated[i, t], steps.truncated[i, t]) == (terminated, truncated)
             assert steps.out_of_bounds[i, t] == (bool(state.done) and bool(state.info.get("out_of_bounds", 0.0)))
@@ -188,16 +195,34 @@ def test_transitions_are_those_of_a_literal_loop(flight: Flight) -> None:
     assert (own_truncations > 3) == (flight.env is not PLAIN)
 
 
-def test_next_observation_is_that_before_the_reset(flight: Flight) -> None:
+def test_an_observation_after_an_end_is_that_of_a_start(flight: Flight) -> None:
     """Beyond the fence or at the last second where an episode ended, while the observation after it is a start."""
-    steps, ended = flight.steps, ends(flight.steps)
-    beyond = steps.next_observation[..., :CLOCK].max(axis=-1) > steps.next_observation[..., FENCE]
+    steps, ended, after = flight.steps, ends(flight.steps), flight.after
+    beyond = after[..., :CLOCK].max(axis=-1) > after[..., FENCE]
     out_of_time = steps.truncated.astype(bool) & ~beyond
     np.testing.assert_array_equal(ended, beyond | out_of_time)
     assert not (steps.observation[..., :CLOCK].max(axis=-1) > steps.observation[..., FENCE]).any()
     following = steps.observation[:, 1:]
     np.testing.assert_array_equal(following[..., CLOCK][ended[:, :-1]], 0.0)
-    np.testing.assert_array_equal(following[~ended[:, :-1]], steps.next_observation[:, :-1][~ended[:, :-1]])
+    np.testing.assert_allclose(following[~ended[:, :-1]], after[:, :-1][~ended[:, :-1]], atol=1e-6)
+
+
+def test_final_observations_are_those_that_v_is_bootstrapped_from(flight: Flight) -> None:
+    """Of each unroll: after its first truncation within bounds and before its last step, zeros without one; and after
+    its last step. Before the reset, both.
+    """
+    seen: Counter[int] = Counter()
+    for each in (flight, *(fly(flight.env, begin(flight.env, seed), seed) for seed in range(20, 24))):
+        after, final = each.after, each.steps.final_observation
+        truncated = (each.steps.truncated > 0) & (each.steps.out_of_bounds == 0)
+        for i, unroll in itertools.product(range(LANES), range(UNROLLS)):
+            *times, last = range(unroll * T, (unroll + 1) * T)
+            within = [t for t in times if truncated[i, t]]
+            expected = after[i, within[0]] if within else np.zeros(5)
+            np.testing.assert_allclose(final[i, 2 * unroll : 2 * unroll + 2], [expected, after[i, last]], atol=1e-6)
+            seen[min(len(within), 2)] += 1
+    assert seen[0] > 3
+    assert flight.env is PLAIN or (seen[1] > 3 and seen[2] > 0)
 
 
 def starts(flight: Flight) -> Array:
@@ -233,7 +258,7 @@ def test_a_restart_keeps_the_lanes_own_parameters() -> None:
 def test_an_environment_without_the_mark_only_terminates(flight: Flight) -> None:
     """Its done is a termination; a mark makes a truncation of it; the two never come together."""
     steps = flight.steps
-    beyond_x, beyond_y = (steps.next_observation[..., i] > steps.next_observation[..., FENCE] for i in (X, Y))
+    beyond_x, beyond_y = (flight.after[..., i] > flight.after[..., FENCE] for i in (X, Y))
     expected = (beyond_x | beyond_y) if flight.env is PLAIN else beyond_x & ~beyond_y
     np.testing.assert_array_equal(steps.terminated.astype(bool), expected)
     assert not (steps.terminated * steps.truncated).any()
@@ -269,9 +294,9 @@ def test_lanes_begin_staggered_by_whole_unrolls(lanes: int, longest: int, unroll
 
 def test_early_counts_the_episodes_cut_short(flight: Flight, unfenced: Flight) -> None:
     """By the environment, before their last step; per lane, over all unrolls."""
-    late = flight.steps.next_observation[..., CLOCK] == LONGEST
+    late = flight.after[..., CLOCK] == LONGEST
     first = np.cumsum(ends(flight.steps), axis=1) - ends(flight.steps) == 0
-    age = flight.steps.next_observation[..., CLOCK] + first * np.asarray(flight.begun.steps)[:, None]
+    age = flight.after[..., CLOCK] + first * np.asarray(flight.begun.steps)[:, None]
     cut_short = ends(flight.steps) & (age < LONGEST)
     assert late.sum() < cut_short.sum()
     np.testing.assert_array_equal(flight.ended.num_early, cut_short.sum(axis=1))
@@ -282,9 +307,10 @@ def test_actions_are_recorded_as_drawn_and_flown_clipped(flight: Flight) -> None
     """The point moves by gain/2 at most, though actions beyond ±1 stand in the record."""
     steps = flight.steps
     assert (np.abs(steps.action) > 1.0).mean() > 0.1
-    moved = (steps.next_observation - steps.observation)[..., :CLOCK]
+    on = ~ends(steps)[:, :-1]
+    moved = (steps.observation[:, 1:] - steps.observation[:, :-1])[..., :CLOCK][on]
     expected = steps.observation[..., GAIN, None] * np.clip(steps.action, -1.0, 1.0) / 2
-    np.testing.assert_allclose(moved, expected, atol=1e-6)
+    np.testing.assert_allclose(moved, expected[:, :-1][on], atol=1e-6)
 
 
 def test_log_mu_is_scipys_normal_density(flight: Flight) -> None:
@@ -300,6 +326,20 @@ def test_noise_is_standard_normal_and_never_repeats(flight: Flight) -> None:
     noise = (flight.steps.action - center) / SIGMA
     assert stats.kstest(noise.ravel(), "norm").pvalue > 0.01
     assert len(np.unique(noise.round(5))) > 0.99 * noise.size
+
+
+def test_noise_of_lanes_steps_and_dimensions_is_independent() -> None:
+    """Standard normal, tails too; no correlation between lanes, dimensions or steps; odd sizes."""
+    lanes, steps, size = jnp.array([0, 1, 2, 1_000_000]), 1501, 3
+    noise = np.asarray(jax.jit(lambda key: rollout.normal(key, lanes, steps, size))(jax.random.key(5)), float)
+    assert noise.shape == (steps, 4, size)
+    assert stats.kstest(noise.ravel(), "norm").pvalue > 0.01
+    assert abs((np.abs(noise) > 3.0).mean() - 0.0027) < 0.0012
+    np.testing.assert_allclose([noise.mean(), noise.std()], [0.0, 1.0], atol=0.03)
+    columns = noise.reshape(steps, -1)
+    columns = np.concatenate([columns[1:], columns[:-1], columns[1:] ** 2], axis=1)
+    correlation = np.corrcoef(columns.T) - np.eye(columns.shape[1])
+    assert np.abs(correlation).max() < 4.5 / np.sqrt(steps)
 
 
 def test_the_key_decides_everything() -> None:
@@ -344,7 +384,7 @@ def test_a_lane_flies_as_it_would_without_its_neighbors() -> None:
 
 def test_lanes_are_handed_on_before_the_reset(flight: Flight) -> None:
     """The state after an unroll is the one last observed, its end marked for the next unroll to see."""
-    np.testing.assert_array_equal(flight.ended.state.obs, flight.steps.next_observation[:, -1])
+    np.testing.assert_allclose(flight.ended.state.obs, flight.after[:, -1], atol=1e-6)
     np.testing.assert_array_equal(flight.ended.done, ends(flight.steps)[:, -1])
 
 
@@ -415,13 +455,14 @@ def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
         state = jax.tree.map(lambda x, i=i: x[i], lanes.state)
         for t in range(50):
             state = step(state, jnp.clip(steps.action[i, t], -1.0, 1.0))
-            np.testing.assert_allclose(steps.next_observation[i, t], state.obs, rtol=1e-3, atol=1e-3)
             np.testing.assert_allclose(steps.reward[i, t], state.reward, rtol=1e-3, atol=1e-3)
             if state.done:
                 fled += 1
-                assert np.linalg.norm(steps.next_observation[i, t, 9:12]) > 3.0
+                assert np.linalg.norm(state.obs[9:12]) > 3.0
                 assert steps.truncated[i, t] == 1
                 assert t == 49 or np.abs(steps.observation[i, t + 1, 9:12]).max() <= 2.0
                 break
+            after = steps.observation[i, t + 1] if t < 49 else steps.final_observation[i, 1]
+            np.testing.assert_allclose(after, state.obs, rtol=1e-3, atol=1e-3)
     assert fled >= 2
     assert not np.asarray(steps.terminated).any()

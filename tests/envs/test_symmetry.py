@@ -228,17 +228,19 @@ def test_a_minibatch_is_turned_trajectory_by_trajectory() -> None:
     env, rng = worlds.make("hover"), np.random.default_rng(0)
     shape, turns = (3, 5), jnp.asarray(rng.random((3, 2)), jnp.float32)
     scalars = [jnp.asarray(rng.normal(size=shape), jnp.float32) for _ in range(5)]
-    observation, after = jnp.asarray(rng.normal(size=(2, *shape, 18)), jnp.float32)
+    observation, final = (jnp.asarray(rng.normal(size=(3, n, 18)), jnp.float32) for n in (5, 2))
     action = jnp.asarray(rng.normal(size=(*shape, 4)), jnp.float32)
-    batch = Transition(observation, action, *scalars[:2], after, *scalars[2:])
+    batch = Transition(observation, action, *scalars, final)
     turned = augmentation.augment(env, batch, turns)
     for i in range(3):
         turn = env.symmetry(turns[i])
         for t in range(5):
             np.testing.assert_allclose(turned.observation[i, t], turn.observation @ observation[i, t], rtol=1e-5)
-            np.testing.assert_allclose(turned.next_observation[i, t], turn.observation @ after[i, t], rtol=1e-5)
             np.testing.assert_allclose(turned.action[i, t], turn.action @ action[i, t], rtol=1e-5)
-    rest = {"observation": 0, "next_observation": 0, "action": 0}
+        for k in range(2):
+            turned_final = turn.observation @ final[i, k]
+            np.testing.assert_allclose(turned.final_observation[i, k], turned_final, rtol=1e-5, atol=1e-6)
+    rest = {"observation": 0, "final_observation": 0, "action": 0}
     jax.tree.map(np.testing.assert_array_equal, turned._replace(**rest), batch._replace(**rest))
     plain = adapt(Plain())
     jax.tree.map(np.testing.assert_array_equal, augmentation.augment(plain, batch, turns), batch)

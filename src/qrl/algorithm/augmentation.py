@@ -27,6 +27,6 @@ def augment(env: TaskEnv, batch: Transition, draws: chex.Array) -> Transition:
         return batch
     return batch._replace(
         observation=transform(batch.observation, symmetries.observation),
-        next_observation=transform(batch.next_observation, symmetries.observation),
+        final_observation=transform(batch.final_observation, symmetries.observation),
         action=transform(batch.action, symmetries.action),
     )

@@ -281,7 +281,7 @@ def _bootstrap_values(
     reward: chex.Array,
     batch: Transition,
 ) -> chex.Array:
-    """V of each step's next observation, constant; [B, T].
+    """V of each step's next observation, constant, as far as it is bootstrapped from; [B, T].
 
     No transition begins out of bounds, so V is never fitted there and extrapolates; bootstrapped from, it diverges. In
     its place stands the last reward forever.
@@ -328,21 +328,17 @@ def _targets(
 def _next_values(critic: Callable[[chex.Array], chex.Array], value: chex.Array, batch: Transition) -> chex.Array:
     """V of the observation after each step of trajectories, [B, T]; `value` is V of the one before.
 
-    The next observation is the next step's own, except at ends. So V is computed anew at the last step and at the first
-    end before it, and everywhere only where a trajectory has more ends.
+    It is V of the next step's own, but at the last step and at truncations before it: of these the first has its own,
+    and further ones, whose final observations are not kept, V of the observation one step earlier. (What stands at
+    terminations and out of bounds is not used.)
     """
-    steps = jnp.arange(value.shape[1])
-    within = (batch.terminated + batch.truncated > 0) & (steps < steps[-1])
-    at = jnp.argmax(within, axis=1)  # 0 where there is none
-    first = within & (steps == at[:, None])
-
-    def shifted() -> chex.Array:
-        after = jnp.take_along_axis(batch.next_observation, at[:, None, None], axis=1)
-        anew = critic(jnp.concatenate([after, batch.next_observation[:, -1:]], axis=1))
-        following = jnp.concatenate([jax.lax.stop_gradient(value)[:, 1:], anew[:, 1:]], axis=1)
-        return jnp.where(first, anew[:, :1], following)
-
-    return jax.lax.cond(jnp.any(within & ~first), lambda: critic(batch.next_observation), shifted)
+    value = jax.lax.stop_gradient(value)
+    within, last = jnp.split(critic(batch.final_observation), 2, axis=1)
+    following = jnp.concatenate([value[:, 1:], last], axis=1)
+    truncated = (batch.truncated > 0) & (batch.out_of_bounds == 0)
+    at = truncated & (jnp.arange(value.shape[1]) < value.shape[1] - 1)
+    first = at & (jnp.cumsum(at, axis=1) == 1)
+    return jnp.where(first, within, jnp.where(at, value, following))
 
 
 def _normalizes_in_loss(spec: LearnerSpec, hyper: Hyperparameters) -> bool:

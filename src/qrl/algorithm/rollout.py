@@ -4,12 +4,15 @@ Brax's AutoResetWrapper restarts a lane from that lane's own first state and los
 episode gets a new draw, and the observation before reset is recorded.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.extend.random import threefry_2x32
 
 from qrl.algorithm.networks import log_density
 from qrl.algorithm.types import State, TaskEnv, Transition, info_flag
@@ -33,6 +36,26 @@ class Lanes(NamedTuple):
     next_state_used: chex.Array  # [N] bool
     num_early: chex.Array  # [N] int32: episodes so far that ended before their last step
     memory: Any = ()  # [N, H] the policy's; () for none
+
+
+class Running(NamedTuple):
+    """The lanes between two steps of an unroll; leading axis N everywhere."""
+
+    lanes: Lanes
+    truncated: chex.Array  # [N] bool: the last step of this unroll ended an episode that is bootstrapped
+    found: chex.Array  # [N] bool: an earlier one did
+    final_observation: chex.Array  # [N, F] after the first that did
+
+
+def _just_found(now: Running) -> chex.Array:
+    """The lanes [N] whose last step was the first of this unroll to end an episode that is bootstrapped."""
+    return now.lanes.done & now.truncated & ~now.found
+
+
+def _find(now: Running) -> Running:
+    first = _just_found(now)
+    final = jnp.where(first[:, None], now.lanes.state.obs, now.final_observation)
+    return now._replace(found=now.found | first, final_observation=final)
 
 
 def init(
@@ -60,33 +83,48 @@ def _start_keys(key: chex.PRNGKey, lane_id: chex.Array, reset_count: chex.Array)
 
 
 def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
-    """Put lanes whose episode is over at their next start, with a memory of zeros.
+    """Put lanes whose episode is over at their next start, with a memory of zeros; the others stay as they are.
 
     Starts are drawn for all lanes at once, and only when some lane has used its own: drawn at every step they would
     cost many times the physics. A lane that has not gets the same start again.
     """
 
-    def draw() -> tuple[State, chex.Array, chex.Array]:
+    def draw(lanes: Lanes) -> Lanes:
         reset_count = lanes.reset_count + lanes.next_state_used
-        keys = _start_keys(key, lanes.lane_id, reset_count)
-        return jax.vmap(env.restart)(lanes.state, keys), reset_count, jnp.zeros_like(lanes.next_state_used)
+        next_state = jax.vmap(env.restart)(lanes.state, _start_keys(key, lanes.lane_id, reset_count))
+        unused = jnp.zeros_like(lanes.next_state_used)
+        return lanes._replace(next_state=next_state, reset_count=reset_count, next_state_used=unused)
 
-    needed = jnp.any(lanes.done & lanes.next_state_used)
-    keep = lanes.next_state, lanes.reset_count, lanes.next_state_used
-    next_state, reset_count, used = jax.lax.cond(needed, draw, lambda: keep)
+    lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes)
 
-    def pick(new: chex.Array, old: chex.Array) -> chex.Array:
-        return jnp.where(lanes.done.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    def pick(kept: bool, new: chex.Array, old: chex.Array) -> chex.Array:
+        return old if kept else jnp.where(lanes.done.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     return lanes._replace(
-        state=jax.tree.map(pick, next_state, lanes.state),
+        state=jax.tree.map(pick, _kept(env, lanes.state), lanes.next_state, lanes.state),
         steps=jnp.where(lanes.done, 0, lanes.steps),
         done=jnp.zeros_like(lanes.done),
-        next_state=next_state,
-        reset_count=reset_count,
-        next_state_used=used | lanes.done,
+        next_state_used=lanes.next_state_used | lanes.done,
         memory=jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory),
     )
+
+
+def _kept(env: TaskEnv, states: State) -> Any:
+    """Of each leaf of the states [N, ...], whether a restart hands it on as it is: a lane's own parameters."""
+    state, key = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states), jax.random.PRNGKey(0)
+    before = jax.tree.leaves(state)
+    program = jax.make_jaxpr(lambda state: env.restart(state, key))(state).jaxpr
+    kept = [old is new for old, new in zip(program.invars, program.outvars, strict=True)]
+    assert len(kept) == len(before)
+    return jax.tree.unflatten(jax.tree.structure(states), kept)
+
+
+def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any], values: Any) -> Any:
+    """act(values) where `needed`(values), of which `act` leaves nothing, else the values themselves.
+
+    A loop takes its values in place, where the branches of a condition copy them.
+    """
+    return jax.lax.while_loop(needed, act, values)
 
 
 def unroll(
@@ -101,16 +139,21 @@ def unroll(
     max_episode_steps: int,
 ) -> tuple[Lanes, Transition]:
     """T steps of every lane under mu = N(mean, sigma²·I), where policy(memory, observation) gives the next memory and
-    the mean; transitions with leaves [N, T, ...], but for the memory [N, H].
+    the mean; transitions with leaves [N, T, ...], but for the last two of `Transition`.
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last step is
     `truncated` where it reached `max_episode_steps` or where the environment's `info` says so ("truncation",
     "truncated", "out_of_bounds"), else `terminated`. `noise_key` is this unroll's own; `start_key` is that of `init`.
     """
-    noise = jax.vmap(lambda n: jax.random.normal(jax.random.fold_in(noise_key, n), (unroll_length, env.action_size)))
 
-    def step(lanes: Lanes, noise: chex.Array) -> tuple[Lanes, Transition]:
-        lanes = restart(env, lanes, start_key)
+    def restart_in_time(now: Running) -> Running:
+        """The restart of lanes whose episode is over, and what V is to be bootstrapped from."""
+        found = _at_most_once(lambda now: jnp.any(_just_found(now)), _find, now)
+        return found._replace(lanes=restart(env, now.lanes, start_key))
+
+    def step(now: Running, noise: chex.Array) -> tuple[Running, Transition]:
+        now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_in_time, now)
+        lanes = now.lanes
         observation = lanes.state.obs
         memory, center = policy(lanes.memory, observation)
         action = center + sigma * noise
@@ -126,29 +169,72 @@ def unroll(
             action=action,
             log_mu=log_density(action, center, sigma),
             reward=state.reward,
-            next_observation=state.obs,
             terminated=terminated.astype(jnp.float32),
             truncated=(done & ~terminated).astype(jnp.float32),
             out_of_bounds=(ended & out_of_bounds).astype(jnp.float32),
+            final_observation=(),
         )
         num_early = lanes.num_early + (ended & (steps < max_episode_steps))
         after = lanes._replace(state=state, steps=steps, done=done, num_early=num_early, memory=memory)
-        return after, transition
+        return now._replace(lanes=after, truncated=done & ~terminated & ~(ended & out_of_bounds)), transition
 
-    def unroll_block(lanes: Lanes) -> tuple[Lanes, Transition]:
+    def begin(lanes: Lanes) -> Running:
+        none = jnp.zeros_like(lanes.done)
+        return Running(lanes, truncated=none, found=none, final_observation=jnp.zeros_like(lanes.state.obs))
+
+    def unroll_block(record: Transition, block: tuple[chex.Array, Lanes]) -> tuple[Transition, Any]:
+        """T steps of the lanes of one block [n], written into the record of all in place."""
+        index, lanes = block
         # The first step's, which is anew in a lane that is about to restart.
         memory = jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory)
-        lanes, transitions = jax.lax.scan(step, lanes, jnp.swapaxes(noise(lanes.lane_id), 0, 1))
-        return lanes, jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), transitions)._replace(memory=memory)
 
-    return _in_blocks(unroll_block, lanes)
+        def one(carry: tuple[Running, Transition], at: tuple[chex.Array, chex.Array]) -> tuple[Any, None]:
+            (now, record), (t, noise) = carry, at
+            now, transition = step(now, noise)
+            return (now, jax.tree.map(functools.partial(_write, index, t), record, transition)), None
 
+        noise = normal(noise_key, lanes.lane_id, unroll_length, env.action_size)
+        times = jnp.arange(unroll_length), noise
+        ((lanes, _, _, within), record), _ = jax.lax.scan(one, (begin(lanes), record), times)
+        return record, (lanes, jnp.stack([within, lanes.state.obs], axis=1), memory)
 
-def _in_blocks(unroll_block: Callable[[Lanes], tuple[Lanes, Transition]], lanes: Lanes) -> tuple[Lanes, Transition]:
-    """`unroll_block` of all lanes, on a CPU in blocks of at most BLOCK_LANES where their number divides so."""
     count = lanes.lane_id.shape[0]
+    num_blocks = _num_blocks(count)
+    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, -1, *x.shape[1:]), lanes)
+    of_step = jax.eval_shape(step, begin(lanes), jnp.zeros((count, env.action_size)))[1]
+    lead = num_blocks, count // num_blocks, unroll_length
+    record = jax.tree.map(lambda x: jnp.zeros((*lead, *x.shape[1:]), x.dtype), of_step)
+    record, after = jax.lax.scan(unroll_block, record, (jnp.arange(num_blocks), blocks))
+    record, (lanes, final, memory) = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), (record, after))
+    return lanes, record._replace(final_observation=final, memory=memory)
+
+
+def _num_blocks(count: int) -> int:
+    """How many blocks `count` lanes are stepped in: on a CPU of at most BLOCK_LANES where their number divides so."""
     block = max(size for size in range(1, BLOCK_LANES + 1) if count % size == 0)
-    if jax.default_backend() != "cpu" or count <= BLOCK_LANES or block < BLOCK_LANES // 8:
-        return unroll_block(lanes)
-    blocks = jax.tree.map(lambda x: x.reshape(-1, block, *x.shape[1:]), lanes)
-    return jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), jax.lax.map(unroll_block, blocks))
+    in_blocks = jax.default_backend() == "cpu" and count > BLOCK_LANES and block >= BLOCK_LANES // 8
+    return count // block if in_blocks else 1
+
+
+def _write(block: chex.Array, step: chex.Array, record: chex.Array, x: chex.Array) -> chex.Array:
+    """The record [blocks, n, T, ...] with `x` [n, ...] as one step of a block."""
+    at = [block, 0, step, *[0] * (x.ndim - 1)]
+    return jax.lax.dynamic_update_slice(record, jnp.expand_dims(x, (0, 2)), at)
+
+
+def normal(key: chex.PRNGKey, lane_id: chex.Array, steps: int, size: int) -> chex.Array:
+    """Standard normal numbers of the lanes `lane_id` [N]: [steps, N, size]; each lane's depend on the key and its id.
+
+    Threefry's counters are the lane and the number's place: a key for each lane, as `fold_in` makes them, takes half as
+    long again as the numbers. From bits to a number the steps are those of `jax.random.normal`.
+    """
+    pairs = -(-steps * size // 2)
+    shape = (pairs, len(lane_id))
+    lane = jnp.broadcast_to(lane_id.astype(jnp.uint32), shape)
+    place = jnp.broadcast_to(jnp.arange(pairs, dtype=jnp.uint32)[:, None], shape)
+    counters = jnp.concatenate([lane.reshape(-1), place.reshape(-1)])  # its halves are hashed in pairs
+    bits = threefry_2x32(jax.random.bits(key, (2,)), counters).reshape(2 * pairs, -1)[: steps * size]
+    least = np.nextafter(np.float32(-1.0), np.float32(0.0))
+    mantissa = jax.lax.bitcast_convert_type((bits >> 9) | jnp.uint32(0x3F800000), jnp.float32) - 1.0  # in [0, 1)
+    uniform = jnp.maximum(least, mantissa * (1.0 - least) + least)
+    return jnp.moveaxis(np.float32(np.sqrt(2.0)) * jax.lax.erf_inv(uniform).reshape(size, steps, -1), 0, -1)

@@ -93,17 +93,21 @@ class TaskEnv(Env, Protocol):
 
 
 class Transition(NamedTuple):
-    """What Algorithm 2 records of a step; leading axes as the holder says ([T, N], [slots, N, T], …)."""
+    """What Algorithm 2 records of a step; leading axes as the holder says ([T, N], [slots, N, T], …).
+
+    The observation after a step is the next step's own, but where an episode ends, and at the last step. So those alone
+    are kept that V is bootstrapped from: without a time axis, as the policy's memory.
+    """
 
     observation: chex.Array  # [..., F] before the step
     action: chex.Array  # [..., A] as drawn from mu, not clipped
     log_mu: chex.Array  # [...] log-density of `action` under the policy that drew it
     reward: chex.Array  # [...]
-    next_observation: chex.Array  # [..., F] after the step, before any reset
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
     out_of_bounds: chex.Array  # [...] float 0 or 1: truncated where no transition of the environment begins
-    memory: Any = ()  # the policy's before the first step of an unroll, without a time axis: [..., H]; () for none
+    final_observation: Any  # [..., 2, F] after the first truncation within bounds (0 for none), and the last step
+    memory: Any = ()  # [..., H] the policy's before the first step of an unroll; () for none
 
 
 class Networks(NamedTuple):

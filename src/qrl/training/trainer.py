@@ -26,7 +26,7 @@ from qrl.training import sharding
 from qrl.training.sharding import LAYOUT, MEMBER, SHARD
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
 
-MANY_LANES = 512  # from which acting takes a good part of a CPU's time
+MANY_LANES = 256  # from which acting takes a good part of a CPU's time
 DONATED = {"train": 0, "apg": 0}  # by program, the argument that it may overwrite
 MAX_SKIPPED_IN_A_ROW = 20  # APG updates whose gradient is not finite, after which a run stops
 
@@ -185,7 +185,8 @@ def _sums(setup: Setup, transitions: Transition, early: chex.Array) -> chex.Arra
         jnp.sum(transitions.reward),
         jnp.sum(transitions.terminated + transitions.truncated),
         jnp.sum(early).astype(jnp.float32),
-        *(jnp.sum(~jnp.isfinite(x)) for x in (transitions.reward, transitions.next_observation)),
+        jnp.sum(~jnp.isfinite(transitions.reward)),
+        sum(jnp.sum(~jnp.isfinite(x)) for x in (transitions.observation, transitions.final_observation)),
     ]
     return sharding.sum_over_shards(setup.mesh, jnp.stack(values))
 
