@@ -74,6 +74,7 @@ SIZES = {
     "seeds": ((1, 16, 128), "seeds of hover that are trained in one program"),
     "training_lanes": ((512, 8192), "environments of the training loop, multiples of 128"),
 }
+CALL_STEPS = 2**21
 MOST_PEER_LANES = 2**18  # with more, what Brax records of 50 steps may not fit a device
 
 
@@ -108,7 +109,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     if not args.budget_seconds > 0:
         parser.error("expected --budget-seconds above 0")
-    if any(value < 1 for name in SIZES for value in getattr(args, name)):
+    if any(value < 1 for name in SIZES for value in getattr(args, name)) or args.call_steps < 1:
         parser.error("expected sizes of at least 1")
     parser.check_folder("--out", args.out)
     try:
@@ -133,6 +134,8 @@ def add_sizes(parser: argparse.ArgumentParser) -> None:
     for name, (default, text) in SIZES.items():
         flag = f"--{name.replace('_', '-')}"
         parser.add_argument(flag, type=int, nargs="+", default=default, metavar="N", help=text)
+    hides = "environment steps of a timed call, which hide what a call costs"
+    parser.add_argument("--call-steps", type=int, default=CALL_STEPS, metavar="N", help=hides)
 
 
 def find_devices() -> list[dict[str, Any]]:
@@ -240,7 +243,7 @@ def command(section: Section, python: Path, args: argparse.Namespace, on_gpu: bo
         return [f"--{name.replace('_', '-')}", *(str(n) for n in getattr(args, name) if n <= most)]
 
     if section.script is None:
-        own = [word for name in SIZES for word in flag(name)]
+        own = [word for name in SIZES for word in flag(name)] + ["--call-steps", str(args.call_steps)]
         return [str(python), "-m", "experiments.gpu.sections", section.name, *own]
     words = [str(python), str(BASELINES / section.script), *flag("lanes", MOST_PEER_LANES)]
     if section.name == "brax":

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from experiments.gpu import trace
-from experiments.gpu.run import add_sizes
+from experiments.gpu.run import CALL_STEPS, add_sizes
 from experiments.profiling import throughput
 from qrl import request, tasks
 from qrl.algorithm.flights import summarize
@@ -37,8 +37,7 @@ from judge import report  # isort: skip  (throughput adds the baselines to the p
 
 FIRST_SEED = 100
 VEHICLE = "crazyflie"  # the real one: lag, drag, sensors, uncertainty
-CALL_STEPS = 2**21  # environment steps of a call
-MOST_SAMPLES = 2**26  # of a call of the learner
+SAMPLES_A_STEP = 32  # of a call of the learner, for one of a rollout
 FEWER_STARTS = 100  # of each seed, where there are more than a few
 MANY_SEEDS = 16
 RESERVED_SECONDS = 8.0  # of a section's time, for what comes after training
@@ -53,6 +52,7 @@ class Sizes(NamedTuple):
     flights: tuple[int, ...]
     seeds: tuple[int, ...]
     training_lanes: tuple[int, ...]
+    call_steps: int = CALL_STEPS  # environment steps of a timed call
     deadline: float = math.inf  # of `time.time()`
 
 
@@ -115,7 +115,7 @@ def plant(sizes: Sizes) -> None:
     for lanes in largest_first(sizes.lanes):
         for figure, env in (("plant, real", real), ("plant, ideal", None)):
             name = f"{figure}, {lanes:,} lanes"
-            attempt(sizes, name, throughput.physics, lanes, key(), env, figure, CALL_STEPS)
+            attempt(sizes, name, throughput.physics, lanes, key(), env, figure, sizes.call_steps)
 
 
 def acting(sizes: Sizes) -> None:
@@ -127,7 +127,7 @@ def acting(sizes: Sizes) -> None:
             one = partial(run, num_envs=lanes, replay_unrolls=1, unroll_length=steps, apg_fraction=0.0)
             figure = f"{name}, T {steps}"
             measure = lambda one=one, lanes=lanes, figure=figure: throughput.acting(  # noqa: E731
-                lanes, key(), one(num_timesteps=10**9), figure, CALL_STEPS
+                lanes, key(), one(num_timesteps=10**9), figure, sizes.call_steps
             )
             attempt(sizes, f"{figure}, {lanes:,} lanes", measure)
 
@@ -135,7 +135,7 @@ def acting(sizes: Sizes) -> None:
 def learner(sizes: Sizes) -> None:
     for samples in largest_first(sizes.minibatches):
         trajectories = max(1, samples // throughput.UNROLL_STEPS)
-        updates = max(4, min(throughput.UPDATES, MOST_SAMPLES // samples))
+        updates = max(4, min(throughput.UPDATES, SAMPLES_A_STEP * sizes.call_steps // samples))
         name = f"learning, {samples:,} samples a minibatch"
         attempt(sizes, name, throughput.learning, trajectories, key(), updates)
 
@@ -144,10 +144,10 @@ def apg(sizes: Sizes) -> None:
     for flights in largest_first(sizes.flights):
         for name, run in (("APG, real", real_hover), ("APG, ideal", partial(run_of, "hover"))):
             figure = f"{name}, {flights:,} flights"
-            attempt(sizes, figure, measure_apg, figure, run, flights)
+            attempt(sizes, figure, measure_apg, figure, run, flights, sizes.call_steps // 4)
 
 
-def measure_apg(figure: str, run_of: Callable[..., record.RunConfig], flights: int) -> None:
+def measure_apg(figure: str, run_of: Callable[..., record.RunConfig], flights: int, call_steps: int) -> None:
     """Environment steps/s of APG updates on so many flights of 200 steps, the way back included."""
     steps = 200
     run = run_of(
@@ -164,7 +164,7 @@ def measure_apg(figure: str, run_of: Callable[..., record.RunConfig], flights: i
     )
     trainer, states, points = throughput.make_run(run)
     advance = driver.compile_apg(trainer, states, points)
-    updates = max(1, CALL_STEPS // 4 // (flights * steps))
+    updates = max(1, call_steps // (flights * steps))
 
     def call(carry: Any) -> Any:
         states, done = carry
@@ -313,8 +313,8 @@ def main() -> None:
     parser.add_argument("--until", type=float, default=math.inf, metavar="T", help="time.time() of the end")
     add_sizes(parser)
     args = vars(parser.parse_args())
-    section, until = args.pop("section"), args.pop("until")
-    sizes = Sizes(**{name: tuple(value) for name, value in args.items()}, deadline=until)
+    section, until, call_steps = args.pop("section"), args.pop("until"), args.pop("call_steps")
+    sizes = Sizes(**{k: tuple(v) for k, v in args.items()}, call_steps=call_steps, deadline=until)
     MEASURES[section](sizes)
 
 

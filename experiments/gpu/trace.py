@@ -20,7 +20,7 @@ class Operation(NamedTuple):
     name: str
     seconds: float  # of all runs, without the operations inside it (of a loop, its body's)
     share: float  # of all operations' seconds
-    count: int
+    times: int
 
 
 class Profile(NamedTuple):
