@@ -40,7 +40,8 @@ VEHICLE = "crazyflie"  # the real one: lag, drag, sensors, uncertainty
 SAMPLES_A_STEP = 32  # of a call of the learner, for one of a rollout
 FEWER_STARTS = 100  # of each seed, where there are more than a few
 MANY_SEEDS = 16
-RESERVED_SECONDS = 8.0  # of a section's time, for what comes after training
+RESERVED_SECONDS = 12.0  # of a section's time, for what comes after training
+CACHE_HIT = "/jax/compilation_cache/cache_hits"
 COPIES = 4  # of an unroll in memory: scanned, transposed, in the replay buffer, and one to spare
 
 
@@ -151,7 +152,7 @@ def measure_apg(figure: str, run_of: Callable[..., record.RunConfig], flights: i
     """Environment steps/s of APG updates on so many flights of 200 steps, the way back included."""
     steps = 200
     run = run_of(
-        num_timesteps=10**5 * flights * steps,
+        num_timesteps=min(10**5, 2**31 // (flights * steps) - 1) * flights * steps,
         num_envs=flights,
         unroll_length=steps,
         replay_unrolls=1,
@@ -195,6 +196,8 @@ def seeds(sizes: Sizes) -> None:
 
 def train(sizes: Sizes, task: str, count: int) -> None:
     """So many seeds in one program: seconds of compiling and training, and what the deployed policies do."""
+    hits: list[str] = []
+    jax.monitoring.register_event_listener(lambda event, **_: hits.append(event) if event == CACHE_HIT else None)
     begun = time.perf_counter()
     trainer, inputs = make_trainer_of(run_of(task, preset=f"{task}_gpu"), count)
     config = trainer.config
@@ -209,7 +212,7 @@ def train(sizes: Sizes, task: str, count: int) -> None:
             driver.compile_train(trainer, states, inputs), apg.result, reports.result(), trainer.gather
         )
         apg.result()
-    compiling = time.perf_counter() - begun
+    compiling, cache_hits = time.perf_counter() - begun, len(hits)
     flies_at: list[float | None] = [None] * count
     chunk = None
     late = lambda: time.time() > sizes.deadline - RESERVED_SECONDS  # noqa: E731
@@ -229,6 +232,7 @@ def train(sizes: Sizes, task: str, count: int) -> None:
             "figure": f"{task}_gpu, {count} seed{'s' * (count > 1)}",
             "seconds": chunk.clock.train_seconds,
             "compile_seconds": compiling,
+            "cache_hits": cache_hits,
             "first_flies_at_seconds": min(first) if first else None,
             "last_flies_at_seconds": max(first) if len(first) == count else None,  # by the reports' starts
             "fly": sum(value >= FLIES for value in success),
@@ -268,7 +272,7 @@ def measure_profile(figure: str, run: record.RunConfig, phase: str) -> None:
         if not config.num_apg_updates:
             raise ValueError("the preset has no APG")
         states = states._replace(unrolls=states.learning_unrolls + 0)
-        advance, done, more = driver.compile_apg(trainer, states, points), config.learning_unrolls, 1
+        advance, done = driver.compile_apg(trainer, states, points), config.learning_unrolls
         more = config.unrolls_per_apg_update
     else:
         advance, done, more = driver.compile_train(trainer, states, points), 0, 2
@@ -280,14 +284,14 @@ def measure_profile(figure: str, run: record.RunConfig, phase: str) -> None:
             begun = time.perf_counter()
             jax.block_until_ready(advance(states, points, np.int32(done + more)))
             seconds = time.perf_counter() - begun
-        found = trace.read(Path(folder))
+        found, origins = trace.read(Path(folder)), trace.origins(advance.as_text())
     report(
         {
             "figure": figure,
             "seconds": seconds,
             "busy": found.busy,
             "launches": found.launches,
-            "operations": [operation._asdict() for operation in found.operations],
+            "operations": [{**o._asdict(), "origin": origins.get(o.name, "")} for o in found.operations],
         }
     )
 

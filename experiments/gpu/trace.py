@@ -1,10 +1,14 @@
 """Which operations a device spent its time on, from what `jax.profiler.trace` wrote."""
 
+import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jax.profiler import ProfileData
+
+
+ORIGIN_PARTS = 3
 
 
 class Span(NamedTuple):
@@ -78,6 +82,15 @@ def spans_of_line(events: Iterable[Any], everything: bool) -> Iterator[Span]:
 def _closed(span: list[Any]) -> Span:
     name, begin, end, inside = span
     return Span(name, begin, end, max(0.0, end - begin - inside))
+
+
+def origins(hlo: str) -> dict[str, str]:
+    """Of each operation of a compiled program's text what it was in JAX: the last parts of its name there. A kernel's
+    name has underscores for dots.
+    """
+    found = re.findall(r'^\s*(?:ROOT )?%?([\w.-]+) = .*op_name="([^"]+)"', hlo, flags=re.MULTILINE)
+    named = {name: "/".join(path.split("/")[-ORIGIN_PARTS:]) for name, path in found}
+    return {name.replace(".", "_"): origin for name, origin in named.items()} | named
 
 
 def covered_ns(spans: Iterable[Span]) -> float:

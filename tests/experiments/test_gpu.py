@@ -225,7 +225,33 @@ def test_bars_are_read_off_the_best_figure() -> None:
     }
     bar = gpu.Bar("", "hover", "hover_gpu, 1 seed", most_seconds=1.0)
     assert gpu.against(bar, [trained]) == "0.8"
-    assert gpu.against(bar, [trained | {"success_mean": 0.9, "success_min": 0.1}]) == "not: success 90.0%"
+    assert gpu.against(bar, [trained | {"success_mean": 0.9, "success_min": 0.1}]) == "not: success 90.0% after 0.8"
+
+
+def test_the_page_tells_what_was_trained_and_where_the_time_goes() -> None:
+    trained = {
+        "section": "hover",
+        "figure": "hover_gpu, 1 seed",
+        "seconds": 0.8,
+        "compile_seconds": 12.3,
+        "cache_hits": 1,
+        "fly": 1,
+        "starts": 1000,
+        "success_mean": 0.995,
+        "success_min": 0.995,
+        "last_flies_at_seconds": 0.6,
+        "done": 0.5,
+        "faults": [],
+    }
+    operations = [operation._asdict() for operation in trace.longest([trace.Span("gemm", 0.0, 2e6, 2e6)] * 1000)]
+    profiled = {"section": "profile", "figure": "p", "seconds": 2.5, "busy": 0.8, "launches": 1000}
+    text = gpu.page(ABOUT, [trained, profiled | {"operations": operations}])
+    assert "0.80 s of training; 12.3 s of compiling, some of it from the cache; 1 fly (99 % of 1000 starts)" in text
+    assert "by the reports after 0.60 s; stopped at 50% of the steps" in text
+    assert "| profile | p | 2500.0 ms, device busy 80%, 1,000 launches |" in text
+    assert text.endswith(
+        "| operation | ms | share | times |\n| --- | --- | --- | --- |\n| gemm | 2000.00 | 100.0% | 1,000 |\n"
+    )
 
 
 def test_an_unroll_fits_the_memory() -> None:
