@@ -302,9 +302,10 @@ def page(about: dict[str, Any], rows: list[Row]) -> str:
     for row in rows:
         if operations := row.get("operations"):
             lines = [
-                [o["name"], f"{o['seconds'] * 1e3:.2f}", f"{o['share']:.1%}", f"{o['times']:,}"] for o in operations
+                [o["name"], o["origin"], f"{o['seconds'] * 1e3:.2f}", f"{o['share']:.1%}", f"{o['times']:,}"]
+                for o in operations
             ]
-            parts += [f"## {row['figure']}", table(["operation", "ms", "share", "times"], lines)]
+            parts += [f"## {row['figure']}", table(["operation", "in JAX", "ms", "share", "times"], lines)]
     return "\n\n".join(parts) + "\n"
 
 

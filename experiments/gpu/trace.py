@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from jax.profiler import ProfileData
 
-
 ORIGIN_PARTS = 3
 
 

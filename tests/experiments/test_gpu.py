@@ -243,15 +243,14 @@ def test_the_page_tells_what_was_trained_and_where_the_time_goes() -> None:
         "done": 0.5,
         "faults": [],
     }
-    operations = [operation._asdict() for operation in trace.longest([trace.Span("gemm", 0.0, 2e6, 2e6)] * 1000)]
+    (operation,) = trace.longest([trace.Span("gemm", 0.0, 2e6, 2e6)] * 1000)
+    operations = [operation._asdict() | {"origin": "body/dot"}]
     profiled = {"section": "profile", "figure": "p", "seconds": 2.5, "busy": 0.8, "launches": 1000}
     text = gpu.page(ABOUT, [trained, profiled | {"operations": operations}])
     assert "0.80 s of training; 12.3 s of compiling, some of it from the cache; 1 fly (99 % of 1000 starts)" in text
     assert "by the reports after 0.60 s; stopped at 50% of the steps" in text
     assert "| profile | p | 2500.0 ms, device busy 80%, 1,000 launches |" in text
-    assert text.endswith(
-        "| operation | ms | share | times |\n| --- | --- | --- | --- |\n| gemm | 2000.00 | 100.0% | 1,000 |\n"
-    )
+    assert text.endswith("| gemm | body/dot | 2000.00 | 100.0% | 1,000 |\n")
 
 
 def test_an_unroll_fits_the_memory() -> None:
@@ -327,5 +326,7 @@ def test_a_trace_of_this_jax_is_read(tmp_path: Path) -> None:
     assert counts.pop("while") == 1
     assert max(counts.values()) == 20  # what stands in the loop's body
     assert sum(operation.share for operation in found.operations) == pytest.approx(1.0)
+    origins = trace.origins(program.lower(x).compile().as_text())
+    assert "dot_general" in " ".join(origins.get(operation.name, "") for operation in found.operations)
     with pytest.raises(ValueError, match="expected a trace"):
         trace.read(tmp_path / "none")
