@@ -4,9 +4,10 @@ PYTHON ?= python3
 VENV := .venv
 QRL := $(VENV)/bin/qrl
 STAMP := $(VENV)/ready
+CUDA := $(VENV)/cuda
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train identify evaluate export view fly sweep seeds tasks figures ablation gallery bench test smoke lint docs stress torture FORCE
+.PHONY: help setup train identify evaluate export view fly sweep seeds tasks figures ablation gallery bench gpu test smoke lint docs stress torture FORCE
 .SUFFIXES:
 MAKEFLAGS += --no-print-directory
 
@@ -48,6 +49,8 @@ define HELP
   make bench                         timings beside other libraries, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
        ARGS="--only judges"            exported kernels in rotorpy and crazyflow, beside RAPTOR; --runs, --starts
+  make gpu                           what this machine's GPU makes of it, in 8 minutes; adds JAX for CUDA to .venv
+       ARGS="--only acting hover"      some of its sections; --lanes, --budget-seconds 480, --any-device
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU
   make lint                          ruff and basedpyright
@@ -127,6 +130,9 @@ gallery: $(STAMP)
 bench: $(STAMP)
 	@exec $(VENV)/bin/python -m experiments.bench.run $(ARGS)
 
+gpu: $(if $(findstring --any-device,$(ARGS)),$(STAMP),$(CUDA))
+	@exec $(VENV)/bin/python -m experiments.gpu.run $(ARGS)
+
 # Two processes: on the two cores that the ten minutes are promised for. Each begins with half of the tests, those of a
 # file together, for they share what they train; one that is done takes over tests of the other.
 WORKERS := -n 2 --dist worksteal
@@ -189,5 +195,14 @@ $(STAMP): requirements.lock pyproject.toml $(shell $(here) || echo FORCE)
 	$(PIP) install -r requirements.lock; \
 	$(PIP) install --no-deps -e .; \
 	touch $@
+
+# JAX for CUDA, in the version of the lock; gigabytes, so not without a card.
+$(CUDA): $(STAMP)
+	@test -e /dev/nvidiactl || test -e /dev/dxg || command -v nvidia-smi >/dev/null || { \
+		echo 'gpu: expected an NVIDIA GPU with its driver; ARGS=--any-device measures what there is' >&2; exit 2; }
+	@echo 'adding JAX for CUDA to $(VENV) (once; some minutes)'
+	@rm -f $@
+	@$(PIP) install -c requirements.lock -e '.[cuda]'
+	@touch $@
 
 FORCE:

@@ -1,4 +1,4 @@
-"""Steps/s of crazyflow's physics on a CPU: `crazyflow_physics.py first_principles|so_rpy --seed N`.
+"""Steps/s of crazyflow's physics: `crazyflow_physics.py first_principles|so_rpy [--lanes N …] [--device gpu] --seed N`.
 
 first_principles (rotors and drag included) takes rotor speeds and is closest to our quadrotor's step, though it
 computes more; so_rpy, fitted to flights, takes attitude and thrust. Symplectic Euler, as ours, at 100 Hz.
@@ -18,7 +18,7 @@ from rates import LANES, UNROLL_STEPS, rate
 FREQUENCY_HZ = 100
 
 
-def physics(dynamics: Dynamics, lanes: int, seed: int) -> None:
+def physics(dynamics: Dynamics, lanes: int, seed: int, device: str) -> None:
     rotors = dynamics == Dynamics.first_principles
     sim = Sim(
         n_worlds=lanes,
@@ -27,7 +27,7 @@ def physics(dynamics: Dynamics, lanes: int, seed: int) -> None:
         integrator=Integrator.symplectic_euler,
         freq=FREQUENCY_HZ,
         attitude_freq=FREQUENCY_HZ,
-        device="cpu",
+        device=device,
         rng_key=seed,
     )
     sim.reset()
@@ -45,10 +45,12 @@ def physics(dynamics: Dynamics, lanes: int, seed: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("dynamics", choices=["first_principles", "so_rpy"])
+    parser.add_argument("--lanes", type=int, nargs="+", default=LANES)
+    parser.add_argument("--device", choices=["cpu", "gpu"], default="cpu")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    for lanes in LANES:
-        physics(Dynamics(args.dynamics), lanes, args.seed)
+    for lanes in args.lanes:
+        physics(Dynamics(args.dynamics), lanes, args.seed, args.device)
 
 
 if __name__ == "__main__":

@@ -11,11 +11,11 @@ class NotInstalled(Exception):
     """A baseline could not be installed; the message is one line."""
 
 
-def python_of(requirements: Path, folder: Path) -> Path:
+def python_of(requirements: Path, folder: Path, seconds: float | None = None) -> Path:
     """The interpreter of the environment in `folder` with what `requirements` pins, created if missing or stale.
 
     The stamp, a hash of the requirements, is written last, so that an interrupted installation is repeated. Raises
-    NotInstalled.
+    NotInstalled, also where pip takes more than so many `seconds`.
     """
     python, stamp = folder / "bin" / "python", folder / "installed"
     wanted = fingerprint(requirements)
@@ -27,7 +27,10 @@ def python_of(requirements: Path, folder: Path) -> Path:
         [sys.executable, "-m", "venv", str(folder)],
         [*pip, "install", "-r", str(requirements)],
     ):
-        done = subprocess.run(command, capture_output=True, text=True)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=seconds)
+        except subprocess.TimeoutExpired:
+            raise NotInstalled(f"pip took more than {seconds:.0f} s") from None
         if done.returncode:
             errors = [line for line in (done.stderr or done.stdout).splitlines() if "error" in line.lower()]
             raise NotInstalled((errors or ["pip failed"])[-1].strip())

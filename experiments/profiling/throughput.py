@@ -39,10 +39,13 @@ from qrl.training.state import member_inputs, stack
 from qrl.training.trainer import Trainer, collect, make_trainer, xla_effort
 from qrl_envs import env as worlds
 from qrl_envs import quadrotor
+from qrl_envs.task_env import TaskEnv
 from rates import LANES, TRAINING, UNROLL_STEPS, rate
 
 BRAX_MINIBATCHES, BRAX_PASSES = 16, 2
 TRAINING_LANES = 512
+CALL_STEPS = LANES[-1] * UNROLL_STEPS  # environment steps of a call, whatever the lanes: its overhead then is the same
+UPDATES = 128  # of a call of `learning`
 
 
 def hover(**learner: Any) -> record.RunConfig:
@@ -53,9 +56,17 @@ def hover(**learner: Any) -> record.RunConfig:
     return request.run_config("hover", None, file, {}, 0, 1)
 
 
-def acting(lanes: int, key: jax.Array) -> None:
-    trainer, states, points = make_run(hover(num_envs=lanes, replay_unrolls=1))
-    unrolls = max(1, LANES[-1] // lanes)  # the same number of steps per call, whose overhead then is the same
+def acting(
+    lanes: int,
+    key: jax.Array,
+    run: record.RunConfig | None = None,
+    figure: str = "acting",
+    call_steps: int = CALL_STEPS,
+) -> None:
+    """Of hover, or of another `run` of so many lanes and a replay buffer of one unroll."""
+    run = run or hover(num_envs=lanes, replay_unrolls=1)
+    trainer, states, points = make_run(run)
+    unrolls = max(1, call_steps // run.learner.steps_per_unroll)
 
     def act(members: Any, carry: Any, key: Any) -> Any:
         (learner, start_key, inputs), one = jax.tree.map(lambda x: x[0], (members, carry))
@@ -79,58 +90,67 @@ def acting(lanes: int, key: jax.Array) -> None:
         return compiled(members, state, subkey), key
 
     first = (states.lanes, states.buffer), key
-    rate(f"acting, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, call, first, jax.block_until_ready)
+    rate(f"{figure}, {lanes:,} lanes", unrolls * run.learner.steps_per_unroll, call, first, jax.block_until_ready)
 
 
-def physics(lanes: int, key: jax.Array) -> None:
-    env = worlds.make("hover")
-    params: Any = env.params
-    dt_s = env.task.control_period_s
+def physics(
+    lanes: int, key: jax.Array, env: TaskEnv | None = None, figure: str = "physics", call_steps: int = CALL_STEPS
+) -> None:
+    """Of the ideal quadrotor, or of the plant of `env` under its actions, without observation and reward."""
+    world = env or worlds.make("hover")
     mesh = make_mesh(jax.devices(), 1, hover(num_envs=lanes).learner.shard_count)
-    blocks = max(mesh.size if mesh else 1, lanes // rollout.BLOCK_LANES)
-    unrolls = max(1, LANES[-1] // lanes)
+    blocks = mesh.size if mesh else 1
+    if jax.default_backend() == "cpu":
+        blocks = max(blocks, lanes // rollout.BLOCK_LANES)
+    unrolls = max(1, call_steps // (lanes * UNROLL_STEPS))
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(world.reset, key))
 
-    def steps(params: Any, thrusts: Any, bodies: Any) -> Any:
-        each = jax.vmap(lambda body, thrust: quadrotor.step(params, body, thrust, dt_s))
+    def steps(params: Any, actions: Any, plants: Any) -> Any:
+        def one(plant: Any, action: Any) -> Any:
+            if env is None:
+                return quadrotor.step(params.physics, plant, action, world.control_period_s)
+            lane = blank.pipeline_state._replace(x=plant, params=params)
+            return env.step(blank.replace(pipeline_state=lane), action).pipeline_state.x
 
         def block(inputs: Any) -> Any:
-            return jax.lax.scan(lambda body, thrust: (each(body, thrust), None), *inputs)[0]
+            return jax.lax.scan(lambda plants, actions: (jax.vmap(one)(plants, actions), None), *inputs)[0]
 
-        return jax.lax.fori_loop(0, unrolls, lambda _, bodies: jax.lax.map(block, (bodies, thrusts)), bodies)
+        return jax.lax.fori_loop(0, unrolls, lambda _, plants: jax.lax.map(block, (plants, actions)), plants)
 
     if mesh:
         steps = jax.shard_map(steps, mesh=mesh, in_specs=(P(), P(SHARD), P(SHARD)), out_specs=P(SHARD), check_vma=False)
-    draw = jax.vmap(jax.vmap(lambda k: quadrotor.draw(params.start, k)))
-    bodies = draw(jax.random.split(key, (blocks, lanes // blocks)))
-    factor = 1.0 + 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, 4))
-    thrusts = params.physics.hover_thrust_N * factor
+    draw = jax.jit(jax.vmap(jax.vmap(lambda key: world.reset(key).pipeline_state.x)))
+    plants = draw(jax.random.split(key, (blocks, lanes // blocks)))
+    actions = 0.01 * jax.random.normal(key, (blocks, UNROLL_STEPS, lanes // blocks, world.action_size))
+    if env is None:
+        vehicle: Any = world.params.physics
+        actions = vehicle.hover_thrust_N * (1.0 + actions)
     if mesh:
-        bodies, thrusts = jax.device_put((bodies, thrusts), NamedSharding(mesh, P(SHARD)))
+        plants, actions = jax.device_put((plants, actions), NamedSharding(mesh, P(SHARD)))
     step = partial(
-        jax.jit(steps, compiler_options=xla_effort(1, lanes)), jax.tree.map(jnp.asarray, params.physics), thrusts
+        jax.jit(steps, compiler_options=xla_effort(1, lanes)), jax.tree.map(jnp.asarray, world.params), actions
     )
-    rate(f"physics, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, step, bodies, jax.block_until_ready)
+    rate(f"{figure}, {lanes:,} lanes", unrolls * lanes * UNROLL_STEPS, step, plants, jax.block_until_ready)
 
 
-def learning(batch_size: int, key: jax.Array) -> None:
-    updates = 128
+def learning(batch_size: int, key: jax.Array, updates: int = UPDATES) -> None:
     run = hover(batch_size=batch_size, updates_per_unroll=updates, warmup_unrolls=1, num_timesteps=10**9)
     samples = updates * batch_size * UNROLL_STEPS
     measure_advance(f"learning, {batch_size * UNROLL_STEPS:,} samples a minibatch", run, 1, samples)
 
 
-def training(unroll_length: int, key: jax.Array) -> None:
+def training(unroll_length: int, key: jax.Array, lanes: int = TRAINING_LANES, figure: str | None = None) -> None:
     run = hover(
-        num_envs=TRAINING_LANES,
+        num_envs=lanes,
         unroll_length=unroll_length,
         num_timesteps=10**9,
         replay_unrolls=1,
         warmup_unrolls=1,
         updates_per_unroll=BRAX_MINIBATCHES * BRAX_PASSES,
-        batch_size=TRAINING_LANES // BRAX_MINIBATCHES,
+        batch_size=lanes // BRAX_MINIBATCHES,
     )
     unrolls = 200 // unroll_length
-    measure_advance(TRAINING[unroll_length], run, unrolls, unrolls * run.learner.steps_per_unroll)
+    measure_advance(figure or TRAINING[unroll_length], run, unrolls, unrolls * run.learner.steps_per_unroll)
 
 
 def measure_advance(figure: str, run: record.RunConfig, unrolls: int, per_call: int) -> None:
