@@ -42,7 +42,7 @@ FEWER_STARTS = 100  # of each seed, where there are more than a few
 MANY_SEEDS = 16
 RESERVED_SECONDS = 12.0  # of a section's time, for what comes after training
 CACHE_HIT = "/jax/compilation_cache/cache_hits"
-COPIES = 4  # of an unroll in memory: scanned, transposed, in the replay buffer, and one to spare
+COPIES = 3  # of an unroll in memory: recorded, in the replay buffer, and one to spare
 
 
 class Sizes(NamedTuple):
@@ -107,7 +107,7 @@ def world(run: record.RunConfig) -> TaskEnv:
 
 def unroll_length(lanes: int, observation_size: int, limit: float) -> int:
     """Steps of an unroll of so many lanes whose copies take half of `limit` bytes; at least 1."""
-    transition_bytes = 4 * (2 * observation_size + 16)
+    transition_bytes = 4 * (observation_size + 16)
     return max(1, min(throughput.UNROLL_STEPS, int(limit / 2 / (COPIES * transition_bytes * lanes))))
 
 

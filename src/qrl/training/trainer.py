@@ -180,15 +180,20 @@ def _updates(
 
 
 def _sums(setup: Setup, transitions: Transition, early: chex.Array) -> chex.Array:
-    """Over all lanes: rewards, ends, early ends, and how many rewards and observations are not finite; [5]."""
+    """Over all lanes: rewards, ends, early ends, and in how many places rewards and observations are not finite; [5]."""
     values = [
         jnp.sum(transitions.reward),
         jnp.sum(transitions.terminated + transitions.truncated),
         jnp.sum(early).astype(jnp.float32),
-        jnp.sum(~jnp.isfinite(transitions.reward)),
-        sum(jnp.sum(~jnp.isfinite(x)) for x in (transitions.observation, transitions.final_observation)),
+        _not_finite(transitions.reward),
+        _not_finite(transitions.observation) + _not_finite(transitions.final_observation),
     ]
     return sharding.sum_over_shards(setup.mesh, jnp.stack(values))
+
+
+def _not_finite(x: chex.Array) -> chex.Array:
+    """0 if all of x [N, T, ...] is finite; []. (0 times anything else is NaN: sums of numbers, not of tests for each.)"""
+    return jnp.sum(~jnp.isfinite(jnp.sum(0.0 * x, axis=0))).astype(jnp.float32)
 
 
 def _first_fault(collected: chex.Array, metrics: chex.Array, updates: chex.Array) -> tuple[chex.Array, chex.Array]:
