@@ -47,6 +47,7 @@ CONTESTANTS = (
     Contestant("crazyflow", "speed", "crazyflow_physics.py", ("first_principles",), "crazyflow"),
     Contestant("crazyflow so_rpy", "speed", "crazyflow_physics.py", ("so_rpy",), "crazyflow"),
     Contestant("qrl command", "speed", "qrl_startup.py", ("hover",)),
+    Contestant("qrl seeds", "speed", "qrl_seeds.py", ("pendulum", "--preset", "pendulum_fast")),
     Contestant("rotorpy crazyflie", JUDGES, "rotorpy_flights.py", ("crazyflie",), "rotorpy"),
     Contestant("rotorpy hummingbird", JUDGES, "rotorpy_flights.py", ("hummingbird",), "rotorpy"),
     Contestant("crazyflow cf21B_500", JUDGES, "crazyflow_flights.py", ("cf21B_500",), "crazyflow_judge"),

@@ -16,6 +16,7 @@ Run = dict[str, Any]
 CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
 BARS = {"pendulum": ("return_mean", -150.0), "hover": ("success", 0.99), "circle": ("success", 0.99)}
 ONE_DEVICE, TWO_DEVICES = ", one device", ", two devices"  # suffixes of a contestant's name, and so of its figures
+REAL = "real plant, "  # prefix of a figure of a plant with lag, drag and sensors
 EASIER_PENDULUM = -160.0  # the threshold of published figures
 TUNED = (
     "**Settings.** qrl trains with presets tuned for just these tasks (`pendulum_fast`, `hover_fast`,"
@@ -180,6 +181,9 @@ def derived(runs: list[Run]) -> str:
                         cell(ratios(by_itself, given), "×"),
                     ]
                 )
+    for figure, values in found.items():
+        if (ideal := found.get(figure.removeprefix(REAL), {}).get(QRL)) and figure.startswith(REAL):
+            rows.append([f"{figure}, over the ideal plant", QRL, cell(ratios(values[QRL], ideal), "×")])
     acting = [values for figure, values in found.items() if figure.startswith("acting, ")]
     for contestant in dict.fromkeys(contestant for values in acting for contestant in values):
         each = [values[contestant] for values in acting if contestant in values]

@@ -36,7 +36,6 @@ from qrl_envs.task_env import TaskEnv
 from judge import report  # isort: skip  (throughput adds the baselines to the path)
 
 FIRST_SEED = 100
-VEHICLE = "crazyflie"  # the real one: lag, drag, sensors, uncertainty
 SAMPLES_A_STEP = 32  # of a call of the learner, for one of a rollout
 FEWER_STARTS = 100  # of each seed, where there are more than a few
 MANY_SEEDS = 16
@@ -96,7 +95,7 @@ def run_of(task: str, vehicle: str | None = None, preset: str | None = None, **l
 
 
 def real_hover(**learner: Any) -> record.RunConfig:
-    return run_of("hover", VEHICLE, **learner)
+    return run_of("hover", throughput.VEHICLE, **learner)
 
 
 def world(run: record.RunConfig) -> TaskEnv:

@@ -1,6 +1,7 @@
-"""Throughput of qrl: `throughput.py [--only acting physics learning training] --seed N`.
+"""Throughput of qrl: `throughput.py [--only acting real physics learning training] --seed N`.
 
 acting     steps/s of `rollout.unroll` of hover: policy 64-64, noise, physics, reward, fresh starts and recording
+real       the same of the Crazyflie as it is, with the recurrent policy of its preset
 physics    steps/s of the quadrotor's step by itself, at thrusts near hover, in blocks of lanes as in `rollout.unroll`
 learning   samples/s through sampling, gather, symmetries, both networks, V-trace, loss, clipping and Adam, in a loop
            with one unroll per 128 updates
@@ -42,6 +43,7 @@ from qrl_envs import quadrotor
 from qrl_envs.task_env import TaskEnv
 from rates import LANES, TRAINING, UNROLL_STEPS, rate
 
+VEHICLE = "crazyflie"  # the real one: lag, drag, sensors, uncertainty
 BRAX_MINIBATCHES, BRAX_PASSES = 16, 2
 TRAINING_LANES = 512
 CALL_STEPS = LANES[-1] * UNROLL_STEPS  # environment steps of a call, whatever the lanes: its overhead then is the same
@@ -91,6 +93,17 @@ def acting(
 
     first = (states.lanes, states.buffer), key
     rate(f"{figure}, {lanes:,} lanes", unrolls * run.learner.steps_per_unroll, call, first, jax.block_until_ready)
+
+
+def real_hover(**learner: Any) -> record.RunConfig:
+    """Hover of a vehicle with lag, drag, sensors and uncertainty, and its preset, whose policy is recurrent."""
+    parts = {"vehicle": VEHICLE}
+    return request.run_config("hover", None, record.ConfigFile(), {"apg_fraction": 0.0} | learner, 0, 1, parts)
+
+
+def acting_real(lanes: int, key: jax.Array) -> None:
+    steps = {"unroll_length": UNROLL_STEPS, "num_timesteps": 10**9}
+    acting(lanes, key, real_hover(num_envs=lanes, replay_unrolls=1, **steps), "real plant, acting")
 
 
 def physics(
@@ -176,6 +189,7 @@ def make_run(run: record.RunConfig) -> tuple[Trainer, Any, Any]:
 
 ROWS: dict[str, tuple[Callable[[int, jax.Array], None], tuple[int, ...]]] = {
     "acting": (acting, LANES),
+    "real": (acting_real, LANES),
     "physics": (physics, LANES),
     "learning": (learning, (8, 32, 256)),
     "training": (training, tuple(TRAINING)),

@@ -180,7 +180,7 @@ def _updates(
 
 
 def _sums(setup: Setup, transitions: Transition, early: chex.Array) -> chex.Array:
-    """Over all lanes: rewards, ends, early ends, and in how many places rewards and observations are not finite; [5]."""
+    """Over all lanes: rewards, ends, early ends, and places where rewards and observations are not finite; [5]."""
     values = [
         jnp.sum(transitions.reward),
         jnp.sum(transitions.terminated + transitions.truncated),
@@ -192,7 +192,7 @@ def _sums(setup: Setup, transitions: Transition, early: chex.Array) -> chex.Arra
 
 
 def _not_finite(x: chex.Array) -> chex.Array:
-    """0 if all of x [N, T, ...] is finite; []. (0 times anything else is NaN: sums of numbers, not of tests for each.)"""
+    """0 if all of x [N, T, ...] is finite; []. Sums of numbers are faster than of tests: 0 times anything else is NaN."""
     return jnp.sum(~jnp.isfinite(jnp.sum(0.0 * x, axis=0))).astype(jnp.float32)
 
 
