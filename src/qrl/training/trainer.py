@@ -192,7 +192,7 @@ def _sums(setup: Setup, transitions: Transition, early: chex.Array) -> chex.Arra
 
 
 def _not_finite(x: chex.Array) -> chex.Array:
-    """0 if all of x [N, T, ...] is finite; []. Sums of numbers are faster than of tests: 0 times anything else is NaN."""
+    """0 if all of x [N, T, ...] is finite; []. Sums of numbers are faster than of tests; 0 times any other is NaN."""
     return jnp.sum(~jnp.isfinite(jnp.sum(0.0 * x, axis=0))).astype(jnp.float32)
 
 
