@@ -294,7 +294,7 @@ class Trainer(NamedTuple):
     fly: Any
     effort: Callable[[str], dict[str, Any]]  # compiler options of a program, by its name
     gather: Callable[[Any], Any]  # values of the programs -> NumPy, from all devices and processes
-    member: Callable[[TrainState, int], TrainState]  # one member's state in NumPy, a copy
+    members: Callable[[TrainState], list[TrainState]]  # the states of all in NumPy, copies
 
     @property
     def config(self) -> Config:
@@ -345,12 +345,16 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
 
     everywhere = sharding.replicated(mesh)
     replicate = jax.jit(lambda tree: tree, out_shardings=everywhere)
-    one_member = jax.jit(lambda states, i: jax.tree.map(lambda x: x[i], states), out_shardings=everywhere)
     steps = (LAYOUT, P(MEMBER), P())
 
     def effort(name: str) -> dict[str, Any]:
         # `init` runs once.
         return xla_effort(0 if name == "init" else 1, config.num_envs if name == "train" else 0)
+
+    def members(states: TrainState) -> list[TrainState]:
+        here = states if states.unrolls.is_fully_addressable else replicate(states)
+        copy = jax.tree.map(np.array, here)  # a live view of a device array would cancel its donation
+        return [jax.tree.map(lambda x, i=i: x[i], copy) for i in range(len(copy.unrolls))]
 
     def jitted(name: str, program: Callable[..., Any]) -> Any:
         return jax.jit(program, donate_argnums=DONATED.get(name, ()), compiler_options=effort(name))
@@ -363,8 +367,7 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
         fly=jitted("fly", fly_padded),
         effort=effort,
         gather=lambda tree: jax.tree.map(np.asarray, replicate(tree) if mesh else tree),
-        # A copy: a live view of a device array would cancel its donation.
-        member=lambda states, i: jax.tree.map(np.asarray, one_member(states, i)),
+        members=members,
     )
 
 
