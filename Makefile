@@ -49,7 +49,7 @@ define HELP
   make bench                         timings beside other libraries, each in an environment of its own: downloads them
        ARGS="--only pendulum"          groups or contestants, as ARGS=--list names them; --seeds 5, --fresh
        ARGS="--only judges"            exported kernels in rotorpy and crazyflow, beside RAPTOR; --runs, --starts
-  make gpu                           what this machine's GPU makes of it, in 8 minutes; adds JAX for CUDA to .venv
+  make gpu                           measure this machine's GPU, in 8 minutes; adds JAX for CUDA to .venv
        ARGS="--only acting hover"      some of its sections; --lanes, --budget-seconds 480, --any-device
   make test                          the tests (ARGS="-k vtrace": any flag of pytest; -n 0: in one process)
   make smoke                         every command end to end, on a CPU

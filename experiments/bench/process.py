@@ -50,7 +50,7 @@ def follow(words: list[str], env: dict[str, str], seconds: float, each: Callable
                 each(line)
             process.wait()
         except BaseException:
-            os.killpg(process.pid, signal.SIGKILL)
+            kill()
             raise
         finally:
             timer.cancel()

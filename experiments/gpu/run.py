@@ -1,6 +1,6 @@
-"""What a GPU makes of qrl: `make gpu`, or `python -m experiments.gpu.run`; without one exit code 2, or --any-device.
+"""Measures qrl on a GPU: `make gpu`, or `python -m experiments.gpu.run`; without one exit code 2, or --any-device.
 
-Sections in processes of their own, the most telling first; each is given its share of the time that is left
+Sections in processes of their own, those of the bars first; each is given its share of the time that is left
 (--budget-seconds). Writes OUT/gpu.json, anew with every figure, and at the end OUT/gpu.md, which it also prints:
 
 plant      steps/s of the plant alone: of a Crazyflie (lag, drag, sensors, uncertainty), and the paper's ideal one
@@ -101,7 +101,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = Parser("gpu", __doc__)
     parser.add_argument("--out", type=Path, default=Path("experiments/out/gpu"), metavar="FOLDER")
     parser.add_argument("--environments", type=Path, default=Path("experiments/out/baselines"), metavar="FOLDER")
-    parser.add_argument("--budget-seconds", type=float, default=480.0, help="time limit of it all", metavar="S")
+    parser.add_argument("--budget-seconds", type=float, default=480.0, help="limit without installing", metavar="S")
     parser.add_argument("--only", nargs="+", choices=names, default=names, help="of the sections above", metavar="NAME")
     parser.add_argument("--any-device", action="store_true", help="measure what JAX has, if it is no GPU")
     add_sizes(parser)

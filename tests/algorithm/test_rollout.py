@@ -208,20 +208,22 @@ def test_an_observation_after_an_end_is_that_of_a_start(flight: Flight) -> None:
 
 
 def test_final_observations_are_those_that_v_is_bootstrapped_from(flight: Flight) -> None:
-    """Of each unroll: after its first truncation within bounds and before its last step, zeros without one; and after
-    its last step. Before the reset, both.
+    """Of each unroll: after its first truncation within bounds and before its last step; and after its last step. Both
+    before the reset, and zeros where V is not bootstrapped.
     """
-    seen: Counter[int] = Counter()
+    seen: Counter[int | str] = Counter()
     for each in (flight, *(fly(flight.env, begin(flight.env, seed), seed) for seed in range(20, 24))):
         after, final = each.after, each.steps.final_observation
-        truncated = (each.steps.truncated > 0) & (each.steps.out_of_bounds == 0)
+        truncated, ended = (each.steps.truncated > 0) & (each.steps.out_of_bounds == 0), ends(each.steps)
         for i, unroll in itertools.product(range(LANES), range(UNROLLS)):
             *times, last = range(unroll * T, (unroll + 1) * T)
             within = [t for t in times if truncated[i, t]]
             expected = after[i, within[0]] if within else np.zeros(5)
-            np.testing.assert_allclose(final[i, 2 * unroll : 2 * unroll + 2], [expected, after[i, last]], atol=1e-6)
-            seen[min(len(within), 2)] += 1
-    assert seen[0] > 3
+            used = truncated[i, last] or not ended[i, last]
+            expected = [expected, after[i, last] if used else np.zeros(5)]
+            np.testing.assert_allclose(final[i, 2 * unroll : 2 * unroll + 2], expected, atol=1e-6)
+            seen.update([min(len(within), 2), "used" if used else "not used"])
+    assert min(seen[0], seen["used"], seen["not used"]) > 3
     assert flight.env is PLAIN or (seen[1] > 3 and seen[2] > 0)
 
 
@@ -253,6 +255,56 @@ def test_a_restart_keeps_the_lanes_own_parameters() -> None:
     marked = flown(MARKED)
     assert ends(marked.steps)[0].sum() > 3
     np.testing.assert_array_equal(marked.steps.observation[..., GAIN], np.repeat(GAINS[:, None], UNROLLS * T, axis=1))
+
+
+class Keeping(Fenced):
+    """The same with leaves of its own: what a restart hands on and a step does not change, and what either changes."""
+
+    def at(self, x: jax.Array) -> State:
+        info = {"mass": x[GAIN], "swapped": x[GAIN], "age": x[CLOCK], "drawn": x[X], "empty": jnp.zeros(0)}
+        return super().at(x).replace(info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        after = super().step(state, action)
+        return after.replace(info=state.info | {"age": state.info["age"] + 1.0})
+
+    def restart(self, state: State, rng: jax.Array) -> State:
+        info = state.info | {"drawn": jax.random.uniform(rng), "swapped": state.info["mass"]}
+        return self.at(self.reset(rng).obs).replace(info=info)
+
+
+@pytest.mark.parametrize("jitted", [False, True])
+def test_a_restart_leaves_alone_what_it_and_a_step_hand_on(jitted: bool) -> None:
+    """Of each lane its own; an age, which steps change, is that of the state that was drawn. A jitted restart hides
+    what it hands on: then nothing is kept, and the lanes are the same.
+    """
+    env = Keeping()
+    lanes = begin_of(env)(jax.random.key(0))
+    mass = jnp.arange(LANES, dtype=jnp.float32)
+    info = lanes.state.info | {"mass": mass, "age": mass}
+    lanes = lanes._replace(state=lanes.state.replace(info=info), done=jnp.arange(LANES) % 2 == 0)
+    kept = rollout._kept(adapt(env), lanes.state).info
+    assert [name for name, value in kept.items() if value] == ["empty", "mass"]
+    if jitted:
+        env.restart = jax.jit(env.restart)
+        assert not any(jax.tree.leaves(rollout._kept(adapt(env), lanes.state)))
+    once = rollout.restart(adapt(env), lanes, jax.random.key(1))
+    np.testing.assert_array_equal(once.state.info["mass"], mass)
+    np.testing.assert_array_equal(once.state.info["swapped"], np.where(lanes.done, mass, lanes.state.info["swapped"]))
+    np.testing.assert_array_equal(once.state.info["age"], mass)
+    assert not np.intersect1d(once.state.info["drawn"][::2], lanes.state.info["drawn"]).size
+    after, _ = unroll_of(env)(once, jax.random.key(2), jax.random.key(1))
+    np.testing.assert_array_equal(after.state.info["mass"], mass)
+
+
+def test_a_restart_of_another_structure_is_refused() -> None:
+    class Another(Keeping):
+        def restart(self, state: State, rng: jax.Array) -> State:
+            return super().restart(state, rng).replace(info={})
+
+    lanes = begin_of(Keeping())(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"restart gives a state of another structure: expected .*mass.*, found"):
+        rollout.restart(adapt(Another()), lanes, jax.random.key(1))
 
 
 def test_an_environment_without_the_mark_only_terminates(flight: Flight) -> None:
@@ -352,7 +404,7 @@ def test_the_key_decides_everything() -> None:
 
 
 def test_members_side_by_side_fly_as_they_would_alone() -> None:
-    """vmapped, the draw of fresh starts under a condition becomes a selection: nothing else may change."""
+    """vmapped, a loop is passed for all where one needs it, and selects: nothing else may change."""
     lanes = [begin(MARKED, seed) for seed in (4, 5)]
     keys = jax.random.split(jax.random.key(6), 2)
     together = jax.jit(jax.vmap(unroll_of(MARKED)))(jax.tree.map(lambda *x: jnp.stack(x), *lanes), keys, keys)

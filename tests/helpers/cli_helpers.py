@@ -52,7 +52,7 @@ def untrained(out: Path, *words: str | Path) -> Path:
         states = trainer.init(driver.seeds(run.seed, run.seeds), inputs)
         for i, folder in enumerate(record.member_folders(out, run)):
             member = loop.Member(folder, run.member(i), 0, [])
-            member.save(run.learner.steps_per_unroll, trainer.members(states)[i], Clock())
+            member.save(run.learner.steps_per_unroll, list(trainer.members(states))[i], Clock())
             member.close()
     return out
 

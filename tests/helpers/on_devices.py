@@ -52,7 +52,7 @@ def main(folder: Path) -> None:
         flights = trainer.fly(states.learner, points, driver.report_starts(config))
         np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.gather((states, flights))))
         if seeds == 1:
-            saved = saved or trainer.members(states)[0]  # from one device, as a checkpoint has it
+            saved = saved or next(trainer.members(states))  # from one device, as a checkpoint has it
             further = trainer.train(device_put(trainer.setup.mesh, stack([saved])), points, np.int32(TEN_UPDATES + 1))
             np.savez(folder / f"further-{count}.npz", **named(trainer.gather(further)))
             learnt = device_put(trainer.setup.mesh, stack([saved._replace(unrolls=np.int32(config.learning_unrolls))]))

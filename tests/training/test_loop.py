@@ -11,8 +11,9 @@ from brax.envs.base import Env, State
 import haste
 import small_run
 from fault_injection import assert_same_leaves, leaves
+from qrl.algorithm.types import Transition
 from qrl.runs import checkpoint, files
-from qrl.training import driver, loop, restore, sharding
+from qrl.training import driver, loop, restore, sharding, trainer
 from qrl.training.state import member_inputs, stack
 from qrl.training.trainer import make_trainer
 from qrl_envs import env as worlds
@@ -122,6 +123,21 @@ def test_nan_stops_the_run_and_keeps_the_last_good_checkpoint(tmp_path: Path) ->
         train(tmp_path, run_config(), env)
     assert all(np.isfinite(leaf).all() for leaf in leaves(tmp_path).values())
     assert [row["env_steps"] for row in files.read_metrics(tmp_path)] == [200, 400]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("name", ["reward", "observation", "final_observation"])
+def test_what_is_not_finite_in_an_unroll_is_counted_as_its_own(name: str, bad: float, pendulum: Env) -> None:
+    """Rewards, and observations: those before steps, and the final ones."""
+    ones = {field: np.ones((4, 3)) for field in Transition._fields if field != "memory"}
+    data = Transition(**ones | {"observation": np.ones((4, 3, 5)), "final_observation": np.ones((4, 2, 5))})
+    setup = trainer.Setup(trainer.adapt(pendulum), run_config().learner)
+    sums = jax.jit(lambda data: trainer._sums(setup, data, jnp.zeros(4)))
+    assert sums(data)[3:].tolist() == [0.0, 0.0]
+    poisoned = np.array(getattr(data, name))
+    poisoned.flat[-1] = bad
+    counts = np.asarray(sums(data._replace(**{name: poisoned}))[3:])
+    np.testing.assert_array_equal(counts > 0, [name == "reward", name != "reward"])
 
 
 def test_fault_in_the_learner_is_named(tmp_path: Path, pendulum: Env) -> None:

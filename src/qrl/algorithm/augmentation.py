@@ -27,8 +27,8 @@ def augment(env: TaskEnv, batch: Transition, draws: chex.Array) -> Transition:
         return batch
     # Together: a product of two rows takes a CPU as long as one of fifty.
     observations = jnp.concatenate([batch.observation, batch.final_observation], axis=1)
-    turned = transform(observations, symmetries.observation)
-    observation, final = jnp.split(turned, [batch.observation.shape[1]], axis=1)
+    transformed = transform(observations, symmetries.observation)
+    observation, final = jnp.split(transformed, [batch.observation.shape[1]], axis=1)
     return batch._replace(
         observation=observation, final_observation=final, action=transform(batch.action, symmetries.action)
     )

@@ -1,8 +1,8 @@
 """Device-resident ring buffer of unrolls.
 
-A slot holds one unroll of all lanes, leaves [N, T, ...], and the memory that they began it with, [N, ...]; a full
-buffer overwrites its oldest slot. `inserted` must stay unbatched where members are vmapped: a batched cursor turns the
-slice update into a scatter.
+A slot holds one unroll of all lanes, leaves [N, T, ...], and of each lane what has no time axis, [N, ...]: its final
+observations, and the memory that it began with. A full buffer overwrites its oldest slot. `inserted` must stay
+unbatched where members are vmapped: a batched cursor turns the slice update into a scatter.
 """
 
 from typing import NamedTuple

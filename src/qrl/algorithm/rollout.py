@@ -38,7 +38,7 @@ class Lanes(NamedTuple):
     memory: Any = ()  # [N, H] the policy's; () for none
 
 
-class Running(NamedTuple):
+class UnrollCarry(NamedTuple):
     """The lanes between two steps of an unroll; leading axis N everywhere."""
 
     lanes: Lanes
@@ -47,13 +47,13 @@ class Running(NamedTuple):
     final_observation: chex.Array  # [N, F] after the first that did
 
 
-def _just_found(now: Running) -> chex.Array:
+def _first_truncation(now: UnrollCarry) -> chex.Array:
     """The lanes [N] whose last step was the first of this unroll to end an episode that is bootstrapped."""
     return now.lanes.done & now.truncated & ~now.found
 
 
-def _find(now: Running) -> Running:
-    first = _just_found(now)
+def _record_final(now: UnrollCarry) -> UnrollCarry:
+    first = _first_truncation(now)
     final = jnp.where(first[:, None], now.lanes.state.obs, now.final_observation)
     return now._replace(found=now.found | first, final_observation=final)
 
@@ -88,6 +88,7 @@ def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
     Starts are drawn for all lanes at once, and only when some lane has used its own: drawn at every step they would
     cost many times the physics. A lane that has not gets the same start again.
     """
+    kept = _kept(env, lanes.state)
 
     def draw(lanes: Lanes) -> Lanes:
         reset_count = lanes.reset_count + lanes.next_state_used
@@ -95,13 +96,13 @@ def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
         unused = jnp.zeros_like(lanes.next_state_used)
         return lanes._replace(next_state=next_state, reset_count=reset_count, next_state_used=unused)
 
-    lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes)
+    lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes, cheap=False)
 
     def pick(kept: bool, new: chex.Array, old: chex.Array) -> chex.Array:
         return old if kept else jnp.where(lanes.done.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     return lanes._replace(
-        state=jax.tree.map(pick, _kept(env, lanes.state), lanes.next_state, lanes.state),
+        state=jax.tree.map(pick, kept, lanes.next_state, lanes.state),
         steps=jnp.where(lanes.done, 0, lanes.steps),
         done=jnp.zeros_like(lanes.done),
         next_state_used=lanes.next_state_used | lanes.done,
@@ -110,21 +111,32 @@ def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
 
 
 def _kept(env: TaskEnv, states: State) -> Any:
-    """Of each leaf of the states [N, ...], whether a restart hands it on as it is: a lane's own parameters."""
-    state, key = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states), jax.random.PRNGKey(0)
-    before = jax.tree.leaves(state)
-    program = jax.make_jaxpr(lambda state: env.restart(state, key))(state).jaxpr
-    kept = [old is new for old, new in zip(program.invars, program.outvars, strict=True)]
-    assert len(kept) == len(before)
-    return jax.tree.unflatten(jax.tree.structure(states), kept)
+    """Of each leaf of the states [N, ...], whether neither a step nor a restart changes it: a lane's own parameters.
 
-
-def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any], values: Any) -> Any:
-    """act(values) where `needed`(values), of which `act` leaves nothing, else the values themselves.
-
-    A loop takes its values in place, where the branches of a condition copy them.
+    Raises ValueError if a restart gives a state of another structure.
     """
-    return jax.lax.while_loop(needed, act, values)
+    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
+    action, key = jax.ShapeDtypeStruct((env.action_size,), jnp.float32), jax.random.PRNGKey(0)
+    structure, kept = jax.tree.structure(state), [True] * len(jax.tree.leaves(state))
+    for name, after in (("step", env.step), ("restart", lambda state, _: env.restart(state, key))):
+        program, result = jax.make_jaxpr(after, return_shape=True)(state, action)
+        if jax.tree.structure(result) != structure:
+            found, expected = jax.tree.structure(result), structure
+            raise ValueError(f"{name} gives a state of another structure: expected {expected}, found {found}")
+        before = program.jaxpr.invars
+        kept = [k and old is new for k, old, new in zip(kept, before, program.jaxpr.outvars, strict=False)]
+    return jax.tree.unflatten(structure, kept)
+
+
+def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any], values: Any, cheap: bool) -> Any:
+    """act(values) where `needed`(values), which is false of the result, else the values themselves.
+
+    On a CPU a loop, which takes its values in place where the branches of a condition copy them. A GPU reads a
+    predicate back to the host: there what is `cheap`, and changes nothing where it is not needed, is done each time.
+    """
+    if jax.default_backend() == "cpu":
+        return jax.lax.while_loop(needed, act, values)
+    return act(values) if cheap else jax.lax.cond(needed(values), act, lambda now: now, values)
 
 
 def unroll(
@@ -146,13 +158,13 @@ def unroll(
     "truncated", "out_of_bounds"), else `terminated`. `noise_key` is this unroll's own; `start_key` is that of `init`.
     """
 
-    def restart_in_time(now: Running) -> Running:
+    def restart_done_lanes(now: UnrollCarry) -> UnrollCarry:
         """The restart of lanes whose episode is over, and what V is to be bootstrapped from."""
-        found = _at_most_once(lambda now: jnp.any(_just_found(now)), _find, now)
+        found = _at_most_once(lambda now: jnp.any(_first_truncation(now)), _record_final, now, cheap=True)
         return found._replace(lanes=restart(env, now.lanes, start_key))
 
-    def step(now: Running, noise: chex.Array) -> tuple[Running, Transition]:
-        now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_in_time, now)
+    def step(now: UnrollCarry, noise: chex.Array) -> tuple[UnrollCarry, Transition]:
+        now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_done_lanes, now, cheap=True)
         lanes = now.lanes
         observation = lanes.state.obs
         memory, center = policy(lanes.memory, observation)
@@ -178,29 +190,31 @@ def unroll(
         after = lanes._replace(state=state, steps=steps, done=done, num_early=num_early, memory=memory)
         return now._replace(lanes=after, truncated=done & ~terminated & ~(ended & out_of_bounds)), transition
 
-    def begin(lanes: Lanes) -> Running:
+    def begin(lanes: Lanes) -> UnrollCarry:
         none = jnp.zeros_like(lanes.done)
-        return Running(lanes, truncated=none, found=none, final_observation=jnp.zeros_like(lanes.state.obs))
+        return UnrollCarry(lanes, truncated=none, found=none, final_observation=jnp.zeros_like(lanes.state.obs))
 
     def unroll_block(record: Transition, block: tuple[chex.Array, Lanes]) -> tuple[Transition, Any]:
         """T steps of the lanes of one block [n], written into the record of all in place."""
         index, lanes = block
-        # The first step's, which is anew in a lane that is about to restart.
+        # Zeros in a lane that is about to restart.
         memory = jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory)
 
-        def one(carry: tuple[Running, Transition], at: tuple[chex.Array, chex.Array]) -> tuple[Any, None]:
+        def write_step(carry: tuple[UnrollCarry, Transition], at: tuple[chex.Array, chex.Array]) -> tuple[Any, None]:
             (now, record), (t, noise) = carry, at
             now, transition = step(now, noise)
             return (now, jax.tree.map(functools.partial(_write, index, t), record, transition)), None
 
         noise = normal(noise_key, lanes.lane_id, unroll_length, env.action_size)
         times = jnp.arange(unroll_length), noise
-        ((lanes, _, _, within), record), _ = jax.lax.scan(one, (begin(lanes), record), times)
-        return record, (lanes, jnp.stack([within, lanes.state.obs], axis=1), memory)
+        (last, record), _ = jax.lax.scan(write_step, (begin(lanes), record), times)
+        bootstrapped = last.truncated | ~last.lanes.done
+        final = jnp.where(bootstrapped[:, None], last.lanes.state.obs, 0.0)
+        return record, (last.lanes, jnp.stack([last.final_observation, final], axis=1), memory)
 
     count = lanes.lane_id.shape[0]
     num_blocks = _num_blocks(count)
-    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, -1, *x.shape[1:]), lanes)
+    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, count // num_blocks, *x.shape[1:]), lanes)
     of_step = jax.eval_shape(step, begin(lanes), jnp.zeros((count, env.action_size)))[1]
     lead = num_blocks, count // num_blocks, unroll_length
     record = jax.tree.map(lambda x: jnp.zeros((*lead, *x.shape[1:]), x.dtype), of_step)

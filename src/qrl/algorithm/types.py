@@ -95,8 +95,8 @@ class TaskEnv(Env, Protocol):
 class Transition(NamedTuple):
     """What Algorithm 2 records of a step; leading axes as the holder says ([T, N], [slots, N, T], …).
 
-    The observation after a step is the next step's own, but where an episode ends, and at the last step. So those alone
-    are kept that V is bootstrapped from: without a time axis, as the policy's memory.
+    The observation after a step is the next step's own, but where an episode ends, and at the last step. Of those
+    `final_observation` keeps two that V is bootstrapped from. It has no time axis, and neither has the memory.
     """
 
     observation: chex.Array  # [..., F] before the step
@@ -106,7 +106,7 @@ class Transition(NamedTuple):
     terminated: chex.Array  # [...] float 0 or 1: the bootstrap is zero
     truncated: chex.Array  # [...] float 0 or 1: bootstrapped, and the trace is cut
     out_of_bounds: chex.Array  # [...] float 0 or 1: truncated where no transition of the environment begins
-    final_observation: Any  # [..., 2, F] after the first truncation within bounds (0 for none), and the last step
+    final_observation: Any  # [..., 2, F] after the first truncation within bounds, after the last step; 0 if not used
     memory: Any = ()  # [..., H] the policy's before the first step of an unroll; () for none
 
 

@@ -122,6 +122,13 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
     given = {"observation_scale", "observation_limit"} & {*flags}
     where = "command line" if given else str(args.config or config.task.name)
     env = tasks.environment(config.task)
+    longest = config.learner.episode_length or getattr(env, "episode_steps", math.inf)
+    steps = config.learner.unroll_length
+    if longest < steps:
+        print_error(
+            f"warning: unroll_length {steps}, episodes of {longest}: at an unroll's truncations after the"
+            f" first V is that of the observation one step earlier; expected at most {longest}"
+        )
     if first:
         initial.check(first, config, env)
     tasks.check(env, config.learner, where)

@@ -227,9 +227,9 @@ class _Recorder:
             member.checkpoints.wait()
 
     def _save(self, chunk: Chunk) -> None:
-        states = self._trainer.members(chunk.states)
-        for member, state in zip(self._members, states, strict=False):
-            member.save(chunk.env_steps, state, chunk.clock)
+        for i, state in enumerate(self._trainer.members(chunk.states)):
+            if self._members:
+                self._members[i].save(chunk.env_steps, state, chunk.clock)
         self._unsaved, self._saved_at = None, chunk.clock.train_seconds
 
     def _check(self, chunk: Chunk) -> None:

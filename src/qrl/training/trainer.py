@@ -4,7 +4,7 @@
 and compiles them.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -294,7 +294,7 @@ class Trainer(NamedTuple):
     fly: Any
     effort: Callable[[str], dict[str, Any]]  # compiler options of a program, by its name
     gather: Callable[[Any], Any]  # values of the programs -> NumPy, from all devices and processes
-    members: Callable[[TrainState], list[TrainState]]  # the states of all in NumPy, copies
+    members: Callable[[TrainState], Iterator[TrainState]]  # the state of one after the other in NumPy, copies
 
     @property
     def config(self) -> Config:
@@ -345,16 +345,20 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
 
     everywhere = sharding.replicated(mesh)
     replicate = jax.jit(lambda tree: tree, out_shardings=everywhere)
+    one_member = jax.jit(lambda states, i: jax.tree.map(lambda x: x[i], states), out_shardings=everywhere)
     steps = (LAYOUT, P(MEMBER), P())
 
     def effort(name: str) -> dict[str, Any]:
         # `init` runs once.
         return xla_effort(0 if name == "init" else 1, config.num_envs if name == "train" else 0)
 
-    def members(states: TrainState) -> list[TrainState]:
-        here = states if states.unrolls.is_fully_addressable else replicate(states)
-        copy = jax.tree.map(np.array, here)  # a live view of a device array would cancel its donation
-        return [jax.tree.map(lambda x, i=i: x[i], copy) for i in range(len(copy.unrolls))]
+    def members(states: TrainState) -> Iterator[TrainState]:
+        count = len(states.unrolls)
+        if not states.unrolls.is_fully_addressable:  # one at a time: all of a member is brought to every process
+            yield from (jax.tree.map(np.asarray, one_member(states, i)) for i in range(count))
+            return
+        copy = jax.tree.map(np.array, states)  # a live view of a device array would cancel its donation
+        yield from (jax.tree.map(lambda x, i=i: x[i], copy) for i in range(count))
 
     def jitted(name: str, program: Callable[..., Any]) -> Any:
         return jax.jit(program, donate_argnums=DONATED.get(name, ()), compiler_options=effort(name))
