@@ -139,10 +139,57 @@ def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any]
     return act(values) if cheap else jax.lax.cond(needed(values), act, lambda now: now, values)
 
 
+Policy = Callable[[Any, chex.Array], tuple[Any, chex.Array]]  # (memory, observation) -> next memory and mean
+
+
+def _step(
+    env: TaskEnv,
+    policy: Policy,
+    sigma: chex.Array,
+    start_key: chex.PRNGKey,
+    max_episode_steps: int,
+    now: UnrollCarry,
+    noise: chex.Array,
+) -> tuple[UnrollCarry, Transition]:
+    """One step of the lanes [n] with the noise [n, A], after the restart of those whose episode is over; its
+    transitions [n, ...], without final observations and memory.
+    """
+
+    def restart_done_lanes(now: UnrollCarry) -> UnrollCarry:
+        found = _at_most_once(lambda now: jnp.any(_first_truncation(now)), _record_final, now, cheap=True)
+        return found._replace(lanes=restart(env, now.lanes, start_key))
+
+    now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_done_lanes, now, cheap=True)
+    lanes = now.lanes
+    observation = lanes.state.obs
+    memory, center = policy(lanes.memory, observation)
+    action = center + sigma * noise
+    state = jax.vmap(env.step)(lanes.state, jnp.clip(action, -1.0, 1.0))
+    steps = lanes.steps + 1
+    ended = state.done.astype(bool)
+    out_of_bounds = info_flag(state, "out_of_bounds")
+    truncated = info_flag(state, "truncated") | info_flag(state, "truncation") | out_of_bounds
+    terminated = ended & ~truncated
+    done = ended | (steps >= max_episode_steps)
+    transition = Transition(
+        observation=observation,
+        action=action,
+        log_mu=log_density(action, center, sigma),
+        reward=state.reward,
+        terminated=terminated.astype(jnp.float32),
+        truncated=(done & ~terminated).astype(jnp.float32),
+        out_of_bounds=(ended & out_of_bounds).astype(jnp.float32),
+        final_observation=(),
+    )
+    num_early = lanes.num_early + (ended & (steps < max_episode_steps))
+    after = lanes._replace(state=state, steps=steps, done=done, num_early=num_early, memory=memory)
+    return now._replace(lanes=after, truncated=done & ~terminated & ~(ended & out_of_bounds)), transition
+
+
 def unroll(
     env: TaskEnv,
     lanes: Lanes,
-    policy: Callable[[Any, chex.Array], tuple[Any, chex.Array]],
+    policy: Policy,
     sigma: chex.Array,
     noise_key: chex.PRNGKey,
     start_key: chex.PRNGKey,
@@ -158,37 +205,7 @@ def unroll(
     "truncated", "out_of_bounds"), else `terminated`. `noise_key` is this unroll's own; `start_key` is that of `init`.
     """
 
-    def restart_done_lanes(now: UnrollCarry) -> UnrollCarry:
-        """The restart of lanes whose episode is over, and what V is to be bootstrapped from."""
-        found = _at_most_once(lambda now: jnp.any(_first_truncation(now)), _record_final, now, cheap=True)
-        return found._replace(lanes=restart(env, now.lanes, start_key))
-
-    def step(now: UnrollCarry, noise: chex.Array) -> tuple[UnrollCarry, Transition]:
-        now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_done_lanes, now, cheap=True)
-        lanes = now.lanes
-        observation = lanes.state.obs
-        memory, center = policy(lanes.memory, observation)
-        action = center + sigma * noise
-        state = jax.vmap(env.step)(lanes.state, jnp.clip(action, -1.0, 1.0))
-        steps = lanes.steps + 1
-        ended = state.done.astype(bool)
-        out_of_bounds = info_flag(state, "out_of_bounds")
-        truncated = info_flag(state, "truncated") | info_flag(state, "truncation") | out_of_bounds
-        terminated = ended & ~truncated
-        done = ended | (steps >= max_episode_steps)
-        transition = Transition(
-            observation=observation,
-            action=action,
-            log_mu=log_density(action, center, sigma),
-            reward=state.reward,
-            terminated=terminated.astype(jnp.float32),
-            truncated=(done & ~terminated).astype(jnp.float32),
-            out_of_bounds=(ended & out_of_bounds).astype(jnp.float32),
-            final_observation=(),
-        )
-        num_early = lanes.num_early + (ended & (steps < max_episode_steps))
-        after = lanes._replace(state=state, steps=steps, done=done, num_early=num_early, memory=memory)
-        return now._replace(lanes=after, truncated=done & ~terminated & ~(ended & out_of_bounds)), transition
+    step = functools.partial(_step, env, policy, sigma, start_key, max_episode_steps)
 
     def begin(lanes: Lanes) -> UnrollCarry:
         none = jnp.zeros_like(lanes.done)
