@@ -12,7 +12,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from qrl.cli.arguments import parse
-from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, print_error
+from qrl.cli.terminal import DONE, FAILED, WRONG_INPUT, keep_interrupts, print_error
 from qrl.config import FORMER_NAMES
 from qrl_envs.specfile import BadInput, read
 
@@ -50,6 +50,7 @@ def limit_size(folder: Path, most_bytes: int) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 failed while running, 2 the input was wrong."""
+    keep_interrupts()
     args = parse(argv)
     subject = {"train": "task", "sweep": "grid", "identify": "vehicle"}.get(args.command, "run")
     if args.command != "tasks":

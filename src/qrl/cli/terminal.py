@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -48,6 +49,22 @@ def stop_requested(message: str = "stopping: saving first") -> Iterator[Callable
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def keep_interrupts() -> None:
+    """Raise a KeyboardInterrupt again that Python ignores, since it fell into a finalizer or a callback of gc.
+
+    JAX registers such a callback: without this, a Ctrl-C in a garbage collection is lost.
+    """
+    others = sys.unraisablehook
+
+    def hook(unraisable: "sys.UnraisableHookArgs") -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):  # raised here, it would be ignored once more
+            threading.Timer(0.01, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
+        else:
+            others(unraisable)
+
+    sys.unraisablehook = hook
 
 
 def plural(count: int, noun: str) -> str:

@@ -1,0 +1,54 @@
+"""The terminal: an interrupt that Python itself would lose."""
+
+import gc
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from qrl.cli import terminal
+
+
+@contextmanager
+def called_by_gc(callback: Callable[..., object]) -> Iterator[None]:
+    gc.callbacks.append(callback)
+    try:
+        yield
+    finally:
+        gc.callbacks.remove(callback)
+
+
+def collect_and_wait() -> None:
+    gc.collect()
+    time.sleep(10.0)
+
+
+@pytest.mark.parametrize("losses", [1, 3])
+def test_interrupt_within_a_callback_of_gc_is_not_lost(monkeypatch: pytest.MonkeyPatch, losses: int) -> None:
+    lost = []
+
+    def interrupted(phase: str, _: dict[str, int]) -> None:
+        if phase == "start" and len(lost) < losses:
+            lost.append(phase)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(sys, "unraisablehook", lambda _: pytest.fail("told as ignored"))
+    terminal.keep_interrupts()
+    with called_by_gc(interrupted):
+        for _ in range(losses):
+            with pytest.raises(KeyboardInterrupt):
+                collect_and_wait()
+    assert len(lost) == losses
+
+
+def test_other_errors_there_go_to_the_hook_of_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    terminal.keep_interrupts()
+    with called_by_gc(lambda *_: 1 / 0):
+        gc.collect()
+    assert told
+    assert all(isinstance(each.exc_value, ZeroDivisionError) for each in told)
