@@ -6,6 +6,7 @@
 import json
 import shutil
 import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -51,10 +52,11 @@ def write_learner(folder: Path, config: RunConfig, learner: Any, env_steps: int)
     """A checkpoint of the learner alone (leading axis: one member)."""
     nothing: Any = [None] * len(TrainState._fields)
     state = TrainState(*nothing)._replace(learner=jax.tree.map(lambda x: np.asarray(x[0]), learner))
-    writer = checkpoint.Writer(folder, config)
-    writer.save(Checkpoint(env_steps, state, Record([], 0.0, 0.0)))
-    writer.wait()
-    writer.close()
+    with ThreadPoolExecutor(1) as thread:
+        writer = checkpoint.Writer(folder, config, thread)
+        writer.save(Checkpoint(env_steps, state, Record([], 0.0, 0.0)))
+        writer.wait()
+        writer.close()
     checkpoint_folder = folder / "checkpoints" / str(env_steps)
     for path in checkpoint_folder.rglob("commit_success.txt"):  # where Orbax wrote it is nobody's business
         path.write_text("Checkpoint commit was successful.\n")

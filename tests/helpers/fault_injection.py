@@ -20,7 +20,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 import once
-from qrl.runs import checkpoint
+from qrl.runs import checkpoint, orbax_files
 from qrl.runs.integrity import MANIFEST
 
 STRESS = os.environ.get("QRL_STRESS") == "1"  # all of it, not a sample
@@ -99,8 +99,8 @@ def metrics(folder: Path) -> list[dict[str, str]]:
 
 def leaves(folder: Path, env_steps: int | None = None) -> dict[str, np.ndarray]:
     """Every leaf of a checkpoint, the last where nothing is said, read by Orbax alone."""
-    path = folder / "checkpoints" / str(env_steps or checkpoint.saved_steps(folder)[0]) / checkpoint.STATE
-    with checkpoint.plain_path(path) as plain, ocp.StandardCheckpointer() as orbax:
+    path = folder / "checkpoints" / str(env_steps or checkpoint.saved_steps(folder)[0]) / orbax_files.STATE
+    with orbax_files.plain_path(path) as plain, ocp.StandardCheckpointer() as orbax:
         return {name: np.asarray(leaf) for name, leaf in orbax.restore(plain).items()}
 
 

@@ -58,21 +58,16 @@ def trainer_of(env: Env, config: Config, mesh: Any = None) -> Trainer:
 _programs: dict[Any, Any] = {}
 
 
-def _compiled_once(compile_program: Callable[..., Any]) -> Callable[..., Any]:
-    def program(trainer: Trainer, states: Any, inputs: Any, store: Store | None = None) -> Any:
-        if store:
-            return compile_program(trainer, states, inputs, store)
-        key = compile_program, trainer, len(states.unrolls), jax.config.read("jax_disable_most_optimizations")
-        if key not in _programs:
-            _programs[key] = compile_program(trainer, states, inputs)
-        return _programs[key]
-
-    return program
+_lower = driver.lower
 
 
-COMPILED_ONCE = {
-    name: _compiled_once(getattr(driver, name)) for name in ("compile_train", "compile_apg", "compile_fly")
-}
+def lower_once(trainer: Trainer, name: str, states: Any, inputs: Any, store: Store | None = None) -> Callable[[], Any]:
+    if store:
+        return _lower(trainer, name, states, inputs, store)
+    key = name, trainer, len(states.unrolls), jax.config.read("jax_disable_most_optimizations")
+    if key not in _programs:
+        _programs[key] = _lower(trainer, name, states, inputs)()
+    return lambda: _programs[key]
 
 
 def train(
@@ -94,7 +89,7 @@ def train(
             stop_after is not None and sum(not isinstance(e, loop.Compiling | loop.Resumed) for e in seen) >= stop_after
         )
 
-    with mock.patch.object(loop, "make_trainer", trainer_of), mock.patch.multiple(driver, **COMPILED_ONCE):
+    with mock.patch.object(loop, "make_trainer", trainer_of), mock.patch.object(driver, "lower", lower_once):
         for event in loop.train(env, run, out, resume=resume, stopped=stopped, store=store):
             seen.append(event)
     return seen

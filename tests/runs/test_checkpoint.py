@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fault_injection import digest
-from qrl.runs import checkpoint
+from qrl.runs import checkpoint, orbax_files
 from qrl.runs.checkpoint import Checkpoint, Record
 from qrl.runs.files import Row
 from qrl.runs.integrity import FORMAT, MANIFEST, CorruptCheckpoint, IncompatibleCheckpoint
@@ -38,7 +39,7 @@ def checkpoint_at(step: int, reports: list[tuple[float, float]] | None = None) -
 
 def save(folder: Path, *checkpoints: Checkpoint) -> Path:
     folder.mkdir(exist_ok=True)
-    writer = checkpoint.Writer(folder, run_config())
+    writer = checkpoint.Writer(folder, run_config(), ThreadPoolExecutor(1))
     for one in checkpoints:
         writer.save(one)
     writer.wait()
@@ -253,16 +254,16 @@ def test_a_removed_or_replaced_folder_is_not_written_to(
 ) -> None:
     """`again`: someone else has created it again. During a save, Orbax creates it again; it gets no manifest."""
     folder = save(tmp_path / "run", checkpoint_at(1))
-    writer = checkpoint.Writer(folder, run_config())
+    writer = checkpoint.Writer(folder, run_config(), ThreadPoolExecutor(1))
 
     def remove() -> None:
         shutil.rmtree(folder)
         if again:
             folder.mkdir()
 
-    orbax_save = checkpoint.ocp.CheckpointManager.save
+    orbax_save = orbax_files.ocp.CheckpointManager.save
     with monkeypatch.context() as patch:
-        patch.setattr(checkpoint.ocp.CheckpointManager, "save", lambda *a, **k: (orbax_save(*a, **k), remove()))
+        patch.setattr(orbax_files.ocp.CheckpointManager, "save", lambda *a, **k: (orbax_save(*a, **k), remove()))
         writer.save(checkpoint_at(2))
         with pytest.raises(OSError, match="the run folder is gone"):
             writer.wait()

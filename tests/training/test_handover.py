@@ -70,7 +70,7 @@ def start(walls: list[float], trainer: Trainer | None = None) -> tuple[TrainStat
     train, apg, fly = trainer.train, trainer.apg, trainer.fly
     if shared:
         abstract = restore.abstract_states(trainer, inputs)
-        train, apg, fly = (program(trainer, abstract, inputs) for program in small_run.COMPILED_ONCE.values())
+        train, apg, fly = (small_run.lower_once(trainer, name, abstract, inputs)() for name in ("train", "apg", "fly"))
     return states, inputs, Programs(train, lambda: apg, fly, trainer.gather)
 
 

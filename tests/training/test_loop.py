@@ -86,6 +86,29 @@ def test_seeds_side_by_side_equal_single_runs(tmp_path: Path) -> None:
             assert comparable_metrics(folder) == comparable_metrics(single)
 
 
+def test_saving_several_seeds_takes_a_share_of_the_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pendulum: Env
+) -> None:
+    """Reports that come sooner than that are not saved, the end is, and nothing else changes."""
+    monkeypatch.setattr(checkpoint.Writer, "seconds", 1e6, raising=False)  # that a save took
+    monkeypatch.setattr(checkpoint.Writer, "__setattr__", _without_seconds)
+    train(tmp_path / "few", run_config(seeds=2), pendulum)
+    train(tmp_path / "one", run_config(), pendulum)
+    monkeypatch.setattr(loop, "SAVE_SHARE", np.inf)
+    train(tmp_path / "all", run_config(seeds=2), pendulum)
+    for seed in ("seed-0", "seed-1"):
+        assert checkpoint.saved_steps(tmp_path / "few" / seed) == [1200]
+        assert checkpoint.saved_steps(tmp_path / "all" / seed)[0] == 1200
+        assert len(checkpoint.saved_steps(tmp_path / "all" / seed)) >= checkpoint.KEEP
+        assert_same_leaves(leaves(tmp_path / "few" / seed), leaves(tmp_path / "all" / seed))
+    assert len(checkpoint.saved_steps(tmp_path / "one")) >= checkpoint.KEEP  # one is saved at each report
+
+
+def _without_seconds(writer: checkpoint.Writer, name: str, value: object) -> None:
+    if name != "seconds":
+        object.__setattr__(writer, name, value)
+
+
 @pytest.mark.parametrize("task", ["pendulum", "circle"])
 def test_the_same_seed_gives_the_same_bits_twice(tmp_path: Path, task: str) -> None:
     """State, ring, lanes and metrics."""

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from qrl_envs import measures
 from qrl_envs.measures import Measured
-from qrl_envs.plots.frame import COLORS, ERRORS, Panel, empty, finish, legend, logarithmic, over_time, successes
+from qrl_envs.plots.frame import COLORS, ERRORS, Panel, empty, finish, legend, logarithmic, over_time, save, successes
 from qrl_envs.task import Task
 
 LINES: tuple[dict[str, Any], ...] = (  # distinguishable without color
@@ -24,7 +24,7 @@ Others = Mapping[str, np.ndarray]  # name -> observations [n, K + 1, F] of anoth
 
 
 def draw(path: Path, task: Task, observations: np.ndarray, others: Others = MappingProxyType({})) -> None:
-    figure(task, observations, others).savefig(path, format="png")
+    save(path, figure(task, observations, others))
 
 
 def figure(task: Task, observations: np.ndarray, others: Others = MappingProxyType({})) -> Figure:

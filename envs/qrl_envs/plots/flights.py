@@ -7,14 +7,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from qrl_envs import measures
-from qrl_envs.plots.frame import COLORS, INK, Panel, empty, finish, in_pi, legend, logarithmic, over_time, successes
+from qrl_envs.plots.frame import (
+    COLORS,
+    INK,
+    Panel,
+    empty,
+    finish,
+    in_pi,
+    legend,
+    logarithmic,
+    over_time,
+    save,
+    successes,
+)
 from qrl_envs.task import CircleReward, PendulumTask, QuadrotorTask, Task
 
 SHOWN = 5  # flights
 
 
 def draw(path: Path, task: Task, observations: np.ndarray) -> None:
-    figure(task, observations).savefig(path, format="png")
+    save(path, figure(task, observations))
 
 
 def figure(task: Task, observations: np.ndarray) -> Figure:

@@ -1,6 +1,7 @@
 """Shared parts of the plots: an empty figure, axes style, legend, colors, and the axes of a quantity over time."""
 
 import textwrap
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -32,6 +33,11 @@ def empty(task: Task, height_in: float) -> Figure:
     title = textwrap.shorten(f"{task.reward.form}: {task.description}", 90, placeholder=" …")
     figure.suptitle(title, fontsize=13, fontweight="bold", color=INK, parse_math=False)
     return figure
+
+
+def save(path: Path, figure: Figure) -> None:
+    """As PNG, drawn once: `savefig` draws all twice, the first time only to lay it out."""
+    FigureCanvasAgg(figure).print_png(path)
 
 
 def finish(axes: Axes, title: str = "") -> None:

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from qrl_envs.plots.frame import COLORS, empty, finish, legend
+from qrl_envs.plots.frame import COLORS, empty, finish, legend, save
 from qrl_envs.task import Task
 
 LEAST_M = 1e-5  # of the logarithmic axis
 
 
 def draw(path: Path, task: Task, results: Mapping[str, Any]) -> None:
-    figure(task, results).savefig(path, format="png")
+    save(path, figure(task, results))
 
 
 def figure(task: Task, results: Mapping[str, Any]) -> Figure:

@@ -10,7 +10,7 @@ from matplotlib.ticker import MultipleLocator
 
 from qrl_envs import measures
 from qrl_envs.measures import speed_m_s, tilt_deg
-from qrl_envs.plots.frame import INK, SHADE, empty, finish, legend, successes
+from qrl_envs.plots.frame import INK, SHADE, empty, finish, legend, save, successes
 from qrl_envs.task import QuadrotorTask
 
 TILT_EDGES_DEG = np.linspace(0.0, 180.0, 13)
@@ -21,7 +21,7 @@ MANY = 50  # failures; more are drawn with smaller crosses
 
 
 def draw(path: Path, task: QuadrotorTask, observations: np.ndarray) -> None:
-    figure(task, observations).savefig(path, format="png")
+    save(path, figure(task, observations))
 
 
 def figure(task: QuadrotorTask, observations: np.ndarray) -> Figure:

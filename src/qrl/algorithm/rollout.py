@@ -205,7 +205,8 @@ def unroll(
     "truncated", "out_of_bounds"), else `terminated`. `noise_key` is this unroll's own; `start_key` is that of `init`.
     """
 
-    step = functools.partial(_step, env, policy, sigma, start_key, max_episode_steps)
+    # Jitted, so that it is traced once for its shapes and for the loop.
+    step = jax.jit(functools.partial(_step, env, policy, sigma, start_key, max_episode_steps), inline=True)
 
     def begin(lanes: Lanes) -> UnrollCarry:
         none = jnp.zeros_like(lanes.done)
@@ -232,7 +233,9 @@ def unroll(
     count = lanes.lane_id.shape[0]
     num_blocks = _num_blocks(count)
     blocks = jax.tree.map(lambda x: x.reshape(num_blocks, count // num_blocks, *x.shape[1:]), lanes)
-    of_step = jax.eval_shape(step, begin(lanes), jnp.zeros((count, env.action_size)))[1]
+    first = jax.tree.map(lambda x: x[0], blocks)
+    noise = jnp.zeros((count // num_blocks, env.action_size))
+    of_step = jax.eval_shape(step, begin(first), noise)[1]
     lead = num_blocks, count // num_blocks, unroll_length
     record = jax.tree.map(lambda x: jnp.zeros((*lead, *x.shape[1:]), x.dtype), of_step)
     record, after = jax.lax.scan(unroll_block, record, (jnp.arange(num_blocks), blocks))

@@ -1,6 +1,7 @@
 """The command line: say what begins, import the rest, and map errors to exit codes."""
 
 import argparse
+import gc
 import importlib
 import os
 import sys
@@ -56,6 +57,7 @@ def main(argv: list[str] | None = None) -> int:
     if args.command != "tasks":
         print(f"qrl {args.command} {getattr(args, subject) or args.config or ''}: loading JAX", flush=True)
     _note_former_names(getattr(args, "config", None) or getattr(args, "grid", None))
+    gc.disable()  # imports make much and drop little
     try:
         configure_jax()
     except KeyboardInterrupt:
@@ -122,7 +124,10 @@ def _command(name: str) -> Callable[[argparse.Namespace], int]:
     """The command of that name, imported lazily: none waits for what another needs."""
     if name == "tasks":
         return _list_tasks
-    return getattr(importlib.import_module(f"qrl.cli.{name}"), name)
+    command = getattr(importlib.import_module(f"qrl.cli.{name}"), name)
+    gc.freeze()  # what was imported stays: each collection would go through all of it
+    gc.enable()
+    return command
 
 
 def _list_tasks(_: argparse.Namespace) -> int:

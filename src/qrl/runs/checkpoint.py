@@ -5,33 +5,23 @@ without a manifest was interrupted while it was written, and is ignored.
 """
 
 import errno
-import glob
-import logging
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+import time
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
-from orbax.checkpoint import checkpoint_managers as policies
 
 from qrl.runs import integrity
 from qrl.runs.files import Row, rank_key
 from qrl.runs.integrity import CorruptCheckpoint, IncompatibleCheckpoint, first_line
 from qrl.runs.record import RunConfig
 
-# Orbax's threads log what fails in them, with a traceback. A checkpoint that was not written raises here.
-logging.getLogger("absl").setLevel(logging.CRITICAL)
 KEEP = 5  # most recent checkpoints; the best one is kept too
-STATE, RECORD = "state", "record"  # Orbax items
-# One process calls Orbax and must not wait for the other processes of the run.
-_ONE_PROCESS = ocp.options.MultiprocessingOptions(primary_host=0, active_processes={0}, barrier_sync_key_prefix="qrl")
 
 
 class Record(NamedTuple):
@@ -59,17 +49,18 @@ def read(folder: Path, run: RunConfig, env_steps: int, target: Any, *, part: boo
     With `part`, fields of `target` that are None are neither read nor compared. Raises CorruptCheckpoint if a file is
     not as it was written, IncompatibleCheckpoint if the checkpoint is of another run or version of qrl.
     """
+    from qrl.runs import orbax_files
+
     path = _root(folder) / str(env_steps)
     integrity.verify(path)
     leaves = _by_name(target)
     try:
-        with plain_path(path) as plain:
-            record = ocp.JsonCheckpointHandler().restore(plain / RECORD)  # pyright: ignore[reportArgumentType]
-            if record.get("run_sha256") != run.sha256:
-                raise IncompatibleCheckpoint(
-                    f"{path}: of another run than config.json (task, hyperparameters, seed or version of qrl differ)"
-                )
-            found = _restore(plain / STATE, leaves, part)
+        record = orbax_files.read_record(path)
+        if record.get("run_sha256") != run.sha256:
+            raise IncompatibleCheckpoint(
+                f"{path}: of another run than config.json (task, hyperparameters, seed or version of qrl differ)"
+            )
+        found = orbax_files.read_state(path, leaves, part)
         record = Record(**{name: record[name] for name in Record._fields})
     except (CorruptCheckpoint, IncompatibleCheckpoint):
         raise
@@ -85,20 +76,6 @@ def read(folder: Path, run: RunConfig, env_steps: int, target: Any, *, part: boo
             )
     state = jax.tree.unflatten(jax.tree.structure(target), [np.asarray(found[name]) for name in leaves])
     return Checkpoint(env_steps, state, record)
-
-
-def _restore(path: Path, leaves: dict[str, Any], part: bool) -> dict[str, Any]:
-    """The saved `leaves`; ValueError if the saved names differ, with `part` only in the fields of `leaves`."""
-    fields = {name.split(".")[0] for name in leaves}
-    # The saved types: Orbax would otherwise convert.
-    as_saved = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), leaves)
-    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=_ONE_PROCESS)
-    with ocp.Checkpointer(handler, multiprocessing_options=_ONE_PROCESS) as orbax:
-        metadata = handler.metadata(path).tree  # pyright: ignore[reportArgumentType]
-        saved = {name for name in metadata if not part or name.split(".")[0] in fields}
-        if differing := saved ^ leaves.keys():  # partial_restore would not report them
-            raise ValueError(f"{min(differing)} is {'missing' if min(differing) in leaves else 'unknown'}")
-        return orbax.restore(path, args=ocp.args.PyTreeRestore(leaves, restore_args=as_saved, partial_restore=part))
 
 
 def _by_name(tree: Any) -> dict[str, Any]:
@@ -123,17 +100,22 @@ def discard_after(folder: Path, env_steps: int) -> None:
 
 
 class Writer:
-    """Saves checkpoints of one run into its folder, one at a time, while training continues.
+    """Saves checkpoints of one run into its folder, one at a time in `thread`, while training continues.
 
-    The thread is ours: Orbax's own async mode prints a traceback when a save fails, and has no hook for a manifest.
+    The thread is not Orbax's: its own async mode prints a traceback when a save fails, and has no hook for a manifest.
+    Writers share one: several that save at once hinder each other.
     """
 
-    def __init__(self, folder: Path, run: RunConfig) -> None:
+    def __init__(self, folder: Path, run: RunConfig, thread: ThreadPoolExecutor) -> None:
+        from qrl.runs import orbax_files
+
+        self._files = orbax_files
         self._folder = folder
         self._descriptor = os.open(folder, os.O_RDONLY)  # while it is open, no new folder can get the same inode
         self._run_sha256 = run.sha256
-        self._thread = ThreadPoolExecutor(1, "checkpoint")
+        self._thread = thread
         self._pending: Future[None] | None = None
+        self.seconds = 0.0  # that the last save took
         _root(folder).mkdir(exist_ok=True)
 
     def save(self, checkpoint: Checkpoint) -> None:
@@ -155,7 +137,8 @@ class Writer:
 
     def close(self) -> None:
         """Finish the save in progress, without reporting its errors."""
-        self._thread.shutdown()
+        if self._pending:
+            wait([self._pending])
         os.close(self._descriptor)
 
     def _check_folder(self) -> None:
@@ -165,48 +148,27 @@ class Writer:
         raise OSError(f"{self._folder}: the run folder is gone")
 
     def _save(self, checkpoint: Checkpoint) -> None:
+        begun = time.perf_counter()
         path = _root(self._folder) / str(checkpoint.env_steps)
         state = _by_name(checkpoint.state)
         record = {"run_sha256": self._run_sha256, **checkpoint.record._asdict()}
-        items = ocp.args.Composite(**{STATE: ocp.args.StandardSave(state), RECORD: ocp.args.JsonSave(record)})
-        options = _options(checkpoint.env_steps, saved_steps(self._folder), checkpoint.record.rows)
+        best = _best(checkpoint.env_steps, saved_steps(self._folder), checkpoint.record.rows)
         try:
             # Orbax prints tracebacks when the disk fills up during a save.
             if shutil.disk_usage(path.parent).free < sum(leaf.nbytes for leaf in state.values()) * 5 // 4 + 2**20:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            with plain_path(path.parent) as plain, ocp.CheckpointManager(plain, options=options) as orbax:
-                orbax.save(checkpoint.env_steps, args=items, force=True)
+            self._files.save(path.parent, checkpoint.env_steps, state, record, KEEP, [best])
             self._check_folder()  # if it was removed meanwhile, Orbax has created it again
             integrity.write_manifest(path)
+            self.seconds = time.perf_counter() - begun
         except (OSError, ValueError) as error:  # ValueError: tensorstore's errors
             raise OSError(f"{path}: the checkpoint could not be written ({first_line(error)})") from None
 
 
-def _options(env_steps: int, saved: list[int], rows: list[Row]) -> ocp.CheckpointManagerOptions:
-    """Keeps the last KEEP checkpoints, and the one with the best report in `rows`."""
+def _best(env_steps: int, saved: list[int], rows: list[Row]) -> int:
+    """Of the checkpoints, and the one at `env_steps`, that with the best report in `rows`."""
     ranks = {row["env_steps"]: (rank_key(row["success"]), rank_key(row["return_mean"])) for row in rows}
-    best = max(ranks.keys() & {*saved, env_steps}, key=lambda step: (ranks[step], -step), default=env_steps)
-    kept = policies.AnyPreservationPolicy([policies.LatestN(KEEP), policies.CustomSteps([int(best)])])
-    return ocp.CheckpointManagerOptions(
-        create=False,
-        cleanup_tmp_directories=True,
-        enable_async_checkpointing=False,
-        preservation_policy=kept,
-        multiprocessing_options=_ONE_PROCESS,
-    )
-
-
-@contextmanager
-def plain_path(folder: Path) -> Iterator[Path]:
-    """An absolute path of `folder` that Orbax, which globs below it unescaped, reads literally; a link if need be."""
-    folder = folder.resolve()
-    if glob.escape(str(folder)) == str(folder):
-        yield folder
-        return
-    with tempfile.TemporaryDirectory(prefix="qrl-") as place:
-        link = Path(place) / "link"
-        link.symlink_to(folder)
-        yield link
+    return int(max(ranks.keys() & {*saved, env_steps}, key=lambda step: (ranks[step], -step), default=env_steps))
 
 
 def _root(folder: Path) -> Path:

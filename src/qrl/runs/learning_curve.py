@@ -16,7 +16,7 @@ PIXELS_PER_INCH = 150
 
 def learning_curve(path: Path, runs: list[Rows], title: str) -> None:
     """Draw return and success over environment steps; `runs` holds one list of metrics.csv's rows for each seed."""
-    learning_curve_figure(runs, title).savefig(path, format="png")
+    FigureCanvasAgg(learning_curve_figure(runs, title)).print_png(path)  # draws once, where `savefig` does twice
 
 
 def learning_curve_figure(runs: list[Rows], title: str) -> Figure:

@@ -66,32 +66,45 @@ def compile_init(trainer: Trainer, count: int, inputs: MemberInputs, store: Stor
     args: Any = seeds(0, count), inputs
     if everywhere := sharding.replicated(trainer.setup.mesh):
         args = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), args)
-    program = traced.trace(store, "init", trainer.init.__wrapped__, args) if store else None
-    if program is None:
-        return jax.eval_shape(trainer.init, seeds(0, count), inputs), trainer.init
-    return program.result, lambda *given: program.compile(args, trainer.effort("init"))(*given)
+    found = traced.find(store, "init", args) if store else None
+    traced_once = jax.jit(trainer.init.__wrapped__)  # for its shapes and its program
+    shapes = found.result if found else jax.eval_shape(traced_once, seeds(0, count), inputs)
+
+    def init(*given: Any) -> TrainState:
+        program = traced.trace(store, "init", traced_once, args) if store else None
+        return program.compile(args, trainer.effort("init"))(*given) if program else trainer.init(*given)
+
+    return shapes, init
 
 
-def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
-    """None for a run of APG alone."""
-    return None if trainer.config.all_apg else _compiled(trainer, "train", (states, inputs, np.int32(0)), store)
+def lower(
+    trainer: Trainer, name: str, states: TrainState, inputs: MemberInputs, store: Store | None = None
+) -> Callable[[], Any]:
+    """Trace a program, "train", "apg" or "fly", for arguments like these; what is returned compiles it.
 
-
-def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
-    """None for a run without APG."""
-    return _compiled(trainer, "apg", (states, inputs, np.int32(0)), store) if trainer.config.num_apg_updates else None
-
-
-def compile_fly(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
-    return _compiled(trainer, "fly", (states.learner, inputs, report_starts(trainer.config)), store)
-
-
-def _compiled(trainer: Trainer, name: str, args: tuple[Any, ...], store: Store | None) -> Any:
+    Threads that compile run side by side, those that trace in turn. Compiled it is None where a run has no such phase.
+    """
+    if trainer.config.all_apg if name == "train" else name == "apg" and not trainer.config.num_apg_updates:
+        return lambda: None
+    flown = states.learner, inputs, report_starts(trainer.config)
+    args = flown if name == "fly" else (states, inputs, np.int32(0))
     jitted = getattr(trainer, name)
     program = traced.trace(store, name, jitted.__wrapped__, args) if store else None
     if program is None:
-        return jitted.lower(*args).compile()
-    return program.compile(args, trainer.effort(name), DONATED.get(name))
+        return jitted.lower(*args).compile
+    return lambda: program.compile(args, trainer.effort(name), DONATED.get(name))
+
+
+def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
+    return lower(trainer, "train", states, inputs, store)()
+
+
+def compile_apg(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
+    return lower(trainer, "apg", states, inputs, store)()
+
+
+def compile_fly(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
+    return lower(trainer, "fly", states, inputs, store)()
 
 
 def seeds(first: int, count: int) -> np.ndarray:

@@ -25,6 +25,7 @@ from qrl.training.traced import Store
 from qrl.training.trainer import Trainer, make_trainer
 
 SAVE_SECONDS = 60.0  # of training, at most, between two checkpoints
+SAVE_SHARE = 0.25  # of the time of training, at most, for checkpoints of several members more often than that
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Compiling:
 
 @dataclass(frozen=True)
 class Compiled:
-    """Compiled, and ready to train."""
+    """Ready to train; what is needed later is still being compiled."""
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,12 @@ Event = Resumed | Compiling | Compiled | Progress | LearningExtended | Reported 
 class Member:
     """The run folder of one seed, open for writing."""
 
-    def __init__(self, folder: Path, run: RunConfig, env_steps: int, rows: list[Row]) -> None:
+    def __init__(
+        self, folder: Path, run: RunConfig, env_steps: int, rows: list[Row], saving: ThreadPoolExecutor
+    ) -> None:
         self.folder = folder
         self.rows = rows
-        self.checkpoints = checkpoint.Writer(folder, run)
+        self.checkpoints = checkpoint.Writer(folder, run, saving)
         self._tensorboard = EventLog(folder / "tensorboard", purge_step=env_steps + 1)
         files.write_metrics(folder, rows)  # rows after the checkpoint are cut
 
@@ -130,11 +133,12 @@ def train(
     target, init = driver.compile_init(trainer, run.seeds, inputs, store)
     abstract = sharding.abstract_sharded(mesh, target)
     members: list[Member] = []
-    executor = ThreadPoolExecutor()  # each compilation takes XLA seconds, and about one core
+    saving = ThreadPoolExecutor(1, "checkpoint")
+    executor = ThreadPoolExecutor(1)  # compiles one program after the other, the first that is needed first
     try:
         yield Compiling()
-        compiled_train = executor.submit(driver.compile_train, trainer, abstract, inputs, store)
-        compiled_fly = executor.submit(driver.compile_fly, trainer, abstract, inputs, store)
+        compiled_train = executor.submit(driver.lower(trainer, "train", abstract, inputs, store))
+        compiled_fly = executor.submit(driver.lower(trainer, "fly", abstract, inputs, store))
         begin, states, clock, rows = 0, None, Clock(), [[] for _ in folders]
         if resume:
             begin, states, clock, rows, notes = _resume(trainer, folders, configs, target)
@@ -142,13 +146,14 @@ def train(
         if states is None:
             states = init(driver.seeds(run.seed, run.seeds), inputs)
             states = _beginning_with(states, *policy()) if policy else states
+        compiled_apg = executor.submit(driver.compile_apg, trainer, abstract, inputs, store)
+        members = [Member(folder, configs[i], begin, rows[i], saving) for i, folder in enumerate(folders)]
         programs = Programs(
             train=compiled_train.result(),
-            fly=compiled_fly.result(),
-            apg=executor.submit(driver.compile_apg, trainer, abstract, inputs, store).result,  # while training goes on
+            fly=lambda *args: compiled_fly.result()(*args),
+            apg=compiled_apg.result,
             gather=trainer.gather,
         )
-        members = [Member(folder, configs[i], begin, rows[i]) for i, folder in enumerate(folders)]
         yield Compiled()
         recorder = _Recorder(trainer, run, members, clock)
         for chunk in driver.run_chunks(states, inputs, programs, run.learner, clock, stopped, multihost.all_gather):
@@ -164,6 +169,7 @@ def train(
         executor.shutdown(cancel_futures=True)
         for member in members:
             member.close()
+        saving.shutdown()
 
 
 def _beginning_with(states: TrainState, policy: Any, statistics: RunningStatistics) -> TrainState:
@@ -213,7 +219,8 @@ class _Recorder:
         for member, row in zip(self._members, chunk.rows, strict=False):
             member.record(row)
         self._unsaved = chunk
-        if chunk.rows or chunk.clock.train_seconds - self._saved_at >= SAVE_SECONDS:
+        seconds = chunk.clock.train_seconds - self._saved_at
+        if seconds >= SAVE_SECONDS or (chunk.rows and not self._too_soon(seconds)):
             self._save(chunk)
         if chunk.rows:
             return Reported(chunk.rows, chunk.seconds_left)
@@ -225,6 +232,11 @@ class _Recorder:
             self._save(self._unsaved)
         for member in self._members:
             member.checkpoints.wait()
+
+    def _too_soon(self, seconds: float) -> bool:
+        """Whether to save several members again, after `seconds` of training, took too much of the time."""
+        taken = sum(member.checkpoints.seconds for member in self._members) if len(self._members) > 1 else 0.0
+        return bool(multihost.all_gather(taken > SAVE_SHARE * seconds).any())  # the same in all processes
 
     def _save(self, chunk: Chunk) -> None:
         for i, state in enumerate(self._trainer.members(chunk.states)):

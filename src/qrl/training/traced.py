@@ -85,14 +85,23 @@ class Program(NamedTuple):
         return lambda *args: jax.tree.unflatten(self.structure, compiled(*jax.tree.leaves(args)))
 
 
-def trace(store: Store, name: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Program | None:
-    """The program of function(*args), from the store or for it; None if it cannot be kept, as with a callback in it."""
+def find(store: Store, name: str, args: tuple[Any, ...]) -> Program | None:
+    """The program of this name for arguments like these, where the store has it."""
+    return _read(_path(store, name, args))
+
+
+def _path(store: Store, name: str, args: tuple[Any, ...]) -> Path:
     leaves, tree = jax.tree.flatten(args)
     like = [str(x if isinstance(x, jax.ShapeDtypeStruct) else jax.typeof(x)) for x in leaves]
     key = hashlib.sha256("\n".join([store.of, name, str(tree), *like]).encode()).hexdigest()
-    path = store.folder / f"qrl-{name}-{key}"
-    if found := _read(path):
+    return store.folder / f"qrl-{name}-{key}"
+
+
+def trace(store: Store, name: str, function: Callable[..., Any], args: tuple[Any, ...]) -> Program | None:
+    """The program of function(*args), from the store or for it; None if it cannot be kept, as with a callback in it."""
+    if found := find(store, name, args):
         return found
+    leaves, tree = jax.tree.flatten(args)
     structure: list[Any] = []
 
     def flat(*leaves: Any) -> list[Any]:
@@ -108,7 +117,7 @@ def trace(store: Store, name: str, function: Callable[..., Any], args: tuple[Any
         content = json.dumps(described).encode() + b"\n" + program.exported.serialize()
     except Exception:  # whatever JAX says of what it cannot write down, the program itself may well run
         return None
-    _write(path, hashlib.sha256(content).digest() + content)
+    _write(_path(store, name, args), hashlib.sha256(content).digest() + content)
     return program
 
 
