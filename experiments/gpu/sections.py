@@ -208,9 +208,11 @@ def train(sizes: Sizes, task: str, count: int) -> None:
         apg = pool.submit(driver.compile_apg, trainer, states, inputs)
         reports = pool.submit(fly.lower(states.learner, inputs, driver.report_starts(config)).compile)
         programs = driver.Programs(
-            driver.compile_train(trainer, states, inputs), apg.result, reports.result(), trainer.gather
+            pool.submit(driver.compile_train, trainer, states, inputs).result,
+            apg.result,
+            reports.result,
+            trainer.gather,
         )
-        apg.result()
     compiling, cache_hits = time.perf_counter() - begun, len(hits)
     flies_at: list[float | None] = [None] * count
     chunk = None

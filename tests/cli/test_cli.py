@@ -57,6 +57,7 @@ def test_brax_is_imported_for_its_own_tasks_alone() -> None:
     """It takes longer than all else that a command begins with."""
     program = (
         "import sys; from qrl import tasks; from qrl.cli import export, sweep, train, view;"
+        "assert 'orbax' not in sys.modules;"
         "print([(name, tasks.environment(tasks.task_record(name)).action_size, 'brax' in sys.modules)"
         " for name in ('hover', 'pendulum', 'fast')])"
     )

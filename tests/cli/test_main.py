@@ -1,5 +1,6 @@
 """The command line before JAX is loaded, and environments of the user's own."""
 
+import gc
 import json
 import os
 from pathlib import Path
@@ -8,10 +9,21 @@ import pytest
 
 from qrl import tasks
 from qrl.cli.arguments import parse
-from qrl.cli.main import _note_former_names, limit_size
+from qrl.cli.main import _note_former_names, limit_size, main, without_collections
 from qrl.config import FORMER_NAMES, Config
 from qrl.request import config_file
 from qrl_envs.specfile import BadInput
+
+
+@pytest.mark.parametrize("code", [0, 2])
+def test_garbage_is_collected_after_a_command(code: int) -> None:
+    """Whether it ends well or is told that its input is wrong; only imports go without."""
+    assert gc.isenabled()
+    assert main(["tasks"] if code == 0 else ["view", "no such run"]) == code
+    assert gc.isenabled()
+    with without_collections():
+        assert not gc.isenabled()
+    assert gc.isenabled()
 
 
 @pytest.mark.parametrize(("former", "name"), FORMER_NAMES.items())

@@ -21,6 +21,14 @@ def called_by_gc(callback: Callable[..., object]) -> Iterator[None]:
         gc.callbacks.remove(callback)
 
 
+@pytest.fixture(autouse=True)
+def _interruptible() -> Iterator[None]:
+    """What a shell starts in the background ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def collect_and_wait() -> None:
     gc.collect()
     time.sleep(10.0)

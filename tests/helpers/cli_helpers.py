@@ -1,5 +1,6 @@
 """The command line, called as a user would, and a run that is over in a moment."""
 
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -44,14 +45,14 @@ def untrained(out: Path, *words: str | Path) -> Path:
     compile a program that trains takes most of a tiny run's time.
     """
     args = build_parser().parse_args(["train", str(words[0]), *TINY.split(), "--out", str(out), *map(str, words[1:])])
-    with ExitStack() as locks:
+    with ExitStack() as locks, ThreadPoolExecutor(1) as saving:
         plan = train.make_plan(args, locks)
         assert plan
         run, env = plan.config, tasks.environment(plan.config.task)
         trainer, inputs = make_trainer(env, run.learner), stack([member_inputs(env, run.learner)] * run.seeds)
         states = trainer.init(driver.seeds(run.seed, run.seeds), inputs)
         for i, folder in enumerate(record.member_folders(out, run)):
-            member = loop.Member(folder, run.member(i), 0, [])
+            member = loop.Member(folder, run.member(i), 0, [], saving)
             member.save(run.learner.steps_per_unroll, list(trainer.members(states))[i], Clock())
             member.close()
     return out

@@ -71,7 +71,7 @@ def start(walls: list[float], trainer: Trainer | None = None) -> tuple[TrainStat
     if shared:
         abstract = restore.abstract_states(trainer, inputs)
         train, apg, fly = (small_run.lower_once(trainer, name, abstract, inputs)() for name in ("train", "apg", "fly"))
-    return states, inputs, Programs(train, lambda: apg, fly, trainer.gather)
+    return states, inputs, Programs(lambda: train, lambda: apg, lambda: fly, trainer.gather)
 
 
 def chunks(

@@ -7,8 +7,8 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from itertools import accumulate
 from pathlib import Path
 
@@ -35,6 +35,18 @@ def configure_jax() -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
+@contextmanager
+def without_collections() -> Iterator[None]:
+    """No garbage collection within: imports make much, drop little, and are gone through each time."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
 def limit_size(folder: Path, most_bytes: int) -> None:
     """Remove the least recently written files of `folder`, until the others have at most `most_bytes`.
 
@@ -57,9 +69,9 @@ def main(argv: list[str] | None = None) -> int:
     if args.command != "tasks":
         print(f"qrl {args.command} {getattr(args, subject) or args.config or ''}: loading JAX", flush=True)
     _note_former_names(getattr(args, "config", None) or getattr(args, "grid", None))
-    gc.disable()  # imports make much and drop little
     try:
-        configure_jax()
+        with without_collections():
+            configure_jax()
     except KeyboardInterrupt:
         print_error("interrupted")
         return FAILED
@@ -124,10 +136,8 @@ def _command(name: str) -> Callable[[argparse.Namespace], int]:
     """The command of that name, imported lazily: none waits for what another needs."""
     if name == "tasks":
         return _list_tasks
-    command = getattr(importlib.import_module(f"qrl.cli.{name}"), name)
-    gc.freeze()  # what was imported stays: each collection would go through all of it
-    gc.enable()
-    return command
+    with without_collections():
+        return getattr(importlib.import_module(f"qrl.cli.{name}"), name)
 
 
 def _list_tasks(_: argparse.Namespace) -> int:

@@ -1,5 +1,6 @@
 """The terminal: exit codes, output, progress, and the request to stop."""
 
+import _thread
 import signal
 import sys
 import threading
@@ -57,10 +58,15 @@ def keep_interrupts() -> None:
     JAX registers such a callback: without this, a Ctrl-C in a garbage collection is lost.
     """
     others = sys.unraisablehook
+    main = threading.main_thread().ident or 0
+
+    def interrupt() -> None:
+        time.sleep(0.01)  # raised at once, it would be ignored once more
+        signal.pthread_kill(main, signal.SIGINT)
 
     def hook(unraisable: "sys.UnraisableHookArgs") -> None:
-        if isinstance(unraisable.exc_value, KeyboardInterrupt):  # raised here, it would be ignored once more
-            threading.Timer(0.01, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            _thread.start_new_thread(interrupt, ())  # takes no lock that the collection may have come in
         else:
             others(unraisable)
 

@@ -8,7 +8,7 @@ import errno
 import os
 import shutil
 import time
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -129,6 +129,11 @@ class Writer:
         if self._pending and self._pending.done():
             self.wait()
 
+    @property
+    def busy(self) -> bool:
+        """Whether a save is in progress."""
+        return self._pending is not None and not self._pending.done()
+
     def wait(self) -> None:
         """Wait until the save in progress is on disk; OSError, naming the folder, if it failed."""
         pending, self._pending = self._pending, None
@@ -138,7 +143,7 @@ class Writer:
     def close(self) -> None:
         """Finish the save in progress, without reporting its errors."""
         if self._pending:
-            wait([self._pending])
+            self._pending.exception()
         os.close(self._descriptor)
 
     def _check_folder(self) -> None:

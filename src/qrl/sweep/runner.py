@@ -234,7 +234,7 @@ def _compile(chunk: Chunk, device: Any) -> _Program:
     train, apg, fly = (
         compiled(trainer, states, inputs) for compiled in (driver.compile_train, driver.compile_apg, driver.compile_fly)
     )
-    programs = driver.Programs(train, lambda: apg, fly, trainer.gather)
+    programs = driver.Programs(lambda: train, lambda: apg, lambda: fly, trainer.gather)
     return _Program(trainer, trainer.init.lower(seeds, inputs).compile(), programs)
 
 

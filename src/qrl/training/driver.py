@@ -28,7 +28,7 @@ class NotFinite(RuntimeError):
 
 
 class Clock(NamedTuple):
-    """Seconds of training, without compilation and evaluation."""
+    """Seconds of training, without evaluation and without waiting for compilation, which may go on beside the first."""
 
     train_seconds: float = 0.0
     report_seconds: float = 0.0  # of these, since the last report
@@ -53,11 +53,11 @@ Program = Callable[[TrainState, MemberInputs, np.int32], TrainState]
 
 @dataclass(frozen=True)
 class Programs:
-    """A trainer's programs, compiled for a number of members."""
+    """A trainer's programs for a number of members, each got when it is needed, since it may still be compiling."""
 
-    train: Program
-    apg: Callable[[], Program]  # called when it is needed, since it may still be compiling
-    fly: Callable[[LearnerState, MemberInputs, jax.Array], Flights]
+    train: Callable[[], Program]
+    apg: Callable[[], Program]
+    fly: Callable[[], Callable[[LearnerState, MemberInputs, jax.Array], Flights]]
     gather: Callable[[Any], Any]
 
 
@@ -68,10 +68,10 @@ def compile_init(trainer: Trainer, count: int, inputs: MemberInputs, store: Stor
         args = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=everywhere), args)
     found = traced.find(store, "init", args) if store else None
     traced_once = jax.jit(trainer.init.__wrapped__)  # for its shapes and its program
-    shapes = found.result if found else jax.eval_shape(traced_once, seeds(0, count), inputs)
+    shapes = found.result if found else jax.eval_shape(traced_once, *args)
 
     def init(*given: Any) -> TrainState:
-        program = traced.trace(store, "init", traced_once, args) if store else None
+        program = found or (traced.trace(store, "init", traced_once, args) if store else None)
         return program.compile(args, trainer.effort("init"))(*given) if program else trainer.init(*given)
 
     return shapes, init
@@ -84,10 +84,12 @@ def lower(
 
     Threads that compile run side by side, those that trace in turn. Compiled it is None where a run has no such phase.
     """
-    if trainer.config.all_apg if name == "train" else name == "apg" and not trainer.config.num_apg_updates:
+    config = trainer.config
+    if (name == "train" and config.all_apg) or (name == "apg" and not config.num_apg_updates):
         return lambda: None
-    flown = states.learner, inputs, report_starts(trainer.config)
-    args = flown if name == "fly" else (states, inputs, np.int32(0))
+    args = states, inputs, np.int32(0)
+    if name == "fly":
+        args = states.learner, inputs, report_starts(config)
     jitted = getattr(trainer, name)
     program = traced.trace(store, name, jitted.__wrapped__, args) if store else None
     if program is None:
@@ -139,7 +141,7 @@ def run_chunks(
         handover = programs.gather(states.learning_unrolls)
         next_handover = min(handover[handover > done], default=config.num_unrolls)
         until = min(report_at, int(next_handover), config.align_to_apg_update(done + size))
-        phases = [programs.train] if (handover > done).any() else []
+        phases = [programs.train()] if (handover > done).any() else []
         phases += [programs.apg()] if (handover <= done).any() else []
         chunk_start = time.perf_counter()
         for program in phases:
@@ -156,7 +158,7 @@ def run_chunks(
         extended: dict[int, int] = {}
         handing_over = (handover == done) & (done < config.num_unrolls)
         if done == report_at or handing_over.any():
-            flights: Flights = programs.gather(programs.fly(states.learner, inputs, starts))
+            flights: Flights = programs.gather(programs.fly()(states.learner, inputs, starts))
             flies = flights.complete.mean(axis=1) >= HANDOVER_SHARE
             # A bounded gradient learns from flights that go wrong, too.
             waits = handing_over & ~flies & (config.apg_cotangent_norm is None)

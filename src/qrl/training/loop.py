@@ -64,7 +64,7 @@ class LearningExtended:
 
 @dataclass(frozen=True)
 class Reported:
-    """A report is recorded, and its checkpoint is being saved."""
+    """A report is recorded."""
 
     rows: list[Row]  # one for each seed
     seconds_left: float
@@ -137,8 +137,10 @@ def train(
     executor = ThreadPoolExecutor(1)  # compiles one program after the other, the first that is needed first
     try:
         yield Compiling()
-        compiled_train = executor.submit(driver.lower(trainer, "train", abstract, inputs, store))
-        compiled_fly = executor.submit(driver.lower(trainer, "fly", abstract, inputs, store))
+        first, second, last = ("apg", "fly", "train") if run.learner.all_apg else ("train", "fly", "apg")
+        compiled = {
+            name: executor.submit(driver.lower(trainer, name, abstract, inputs, store)) for name in (first, second)
+        }
         begin, states, clock, rows = 0, None, Clock(), [[] for _ in folders]
         if resume:
             begin, states, clock, rows, notes = _resume(trainer, folders, configs, target)
@@ -146,14 +148,12 @@ def train(
         if states is None:
             states = init(driver.seeds(run.seed, run.seeds), inputs)
             states = _beginning_with(states, *policy()) if policy else states
-        compiled_apg = executor.submit(driver.compile_apg, trainer, abstract, inputs, store)
-        members = [Member(folder, configs[i], begin, rows[i], saving) for i, folder in enumerate(folders)]
-        programs = Programs(
-            train=compiled_train.result(),
-            fly=lambda *args: compiled_fly.result()(*args),
-            apg=compiled_apg.result,
-            gather=trainer.gather,
-        )
+        # The last is traced there, too, while training goes on.
+        compiled[last] = executor.submit(lambda: driver.lower(trainer, last, abstract, inputs, store)())
+        for i, folder in enumerate(folders):
+            members.append(Member(folder, configs[i], begin, rows[i], saving))
+        compiled[first].result()
+        programs = Programs(**{name: future.result for name, future in compiled.items()}, gather=trainer.gather)
         yield Compiled()
         recorder = _Recorder(trainer, run, members, clock)
         for chunk in driver.run_chunks(states, inputs, programs, run.learner, clock, stopped, multihost.all_gather):
@@ -163,7 +163,7 @@ def train(
                 yield LearningExtended({run.seed + i: steps for i, steps in chunk.extended.items()})
         recorder.finish()
         if begin == run.learner.num_unrolls * run.learner.steps_per_unroll:
-            flights = programs.gather(programs.fly(states.learner, inputs, driver.report_starts(run.learner)))
+            flights = programs.gather(programs.fly()(states.learner, inputs, driver.report_starts(run.learner)))
             yield Finished(flights, [member.rows for member in members])
     finally:
         executor.shutdown(cancel_futures=True)
@@ -235,8 +235,12 @@ class _Recorder:
 
     def _too_soon(self, seconds: float) -> bool:
         """Whether to save several members again, after `seconds` of training, took too much of the time."""
-        taken = sum(member.checkpoints.seconds for member in self._members) if len(self._members) > 1 else 0.0
-        return bool(multihost.all_gather(taken > SAVE_SHARE * seconds).any())  # the same in all processes
+        if self._run.seeds == 1:
+            return False
+        writers = [member.checkpoints for member in self._members]
+        taken = sum(writer.seconds for writer in writers)
+        too_soon = taken > SAVE_SHARE * seconds or any(writer.busy for writer in writers)
+        return bool(multihost.all_gather(too_soon).any())  # the same in all processes
 
     def _save(self, chunk: Chunk) -> None:
         for i, state in enumerate(self._trainer.members(chunk.states)):
