@@ -79,7 +79,7 @@ def plot(path: Path, runs: list[Run]) -> None:
         axes.annotate(text, (max(bar.ratio.max, 1.0), y), (5, 0), textcoords="offset points", va="center", fontsize=8)
     axes.set_xscale("log")
     axes.axvline(1.0, color="#333333", linewidth=1.0)
-    axes.set_yticks(range(len(found)), [textwrap.fill(bar.label, 48) for bar in found], fontsize=8)
+    axes.set_yticks(range(len(found)), [textwrap.fill(bar.label, 62) for bar in found], fontsize=8)
     axes.invert_yaxis()
     axes.margins(x=0.12, y=0.01)
     axes.set_xlabel(
