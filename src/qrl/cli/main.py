@@ -92,13 +92,14 @@ def _note_former_names(path: Path | None) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
-    import jax
+    with without_collections():
+        import jax
 
-    from qrl.export.kernel import AccumulatorOverflow
-    from qrl.export.targets import VerificationFailed
-    from qrl.runs import shipped
-    from qrl.runs.integrity import IncompatibleCheckpoint
-    from qrl.training.driver import NotFinite
+        from qrl.export.kernel import AccumulatorOverflow
+        from qrl.export.targets import VerificationFailed
+        from qrl.runs import shipped
+        from qrl.runs.integrity import IncompatibleCheckpoint
+        from qrl.training.driver import NotFinite
 
     code = FAILED
     try:
@@ -137,7 +138,10 @@ def _command(name: str) -> Callable[[argparse.Namespace], int]:
     if name == "tasks":
         return _list_tasks
     with without_collections():
-        return getattr(importlib.import_module(f"qrl.cli.{name}"), name)
+        command = getattr(importlib.import_module(f"qrl.cli.{name}"), name)
+    if not gc.get_freeze_count():  # once in a process: what was imported stays, and need not be gone through again
+        gc.freeze()
+    return command
 
 
 def _list_tasks(_: argparse.Namespace) -> int:
