@@ -28,6 +28,7 @@ class Room(NamedTuple):
 
 WORLDS = {"qrl_envs"}
 INPUT = {"qrl_envs.specfile"}  # no world: how wrong input is said
+STORED = {"qrl_envs.fusion"}  # no world either: what a compiler computes once
 MATHS = {"jax", "numpy", "chex"}
 
 ROOMS: dict[str, dict[str, Room]] = {
@@ -37,7 +38,7 @@ ROOMS: dict[str, dict[str, Room]] = {
         "__main__": Room({"cli"}, set()),
         "config": Room(set(), {"pydantic", "numpy"} | INPUT),
         "export": Room(set(), {"numpy", "onnx"}),
-        "algorithm": Room({"config"}, MATHS | {"flax", "optax"}),
+        "algorithm": Room({"config"}, MATHS | STORED | {"flax", "optax"}),
         "runs": Room({"config"}, MATHS | INPUT | {"orbax", "pydantic", "matplotlib", "tensorboardX"}),
         "training": Room({"runs", "algorithm", "config"}, MATHS | INPUT),
         "tasks": Room({"runs", "algorithm", "config"}, MATHS | WORLDS | {"brax"}),
@@ -53,7 +54,8 @@ ROOMS: dict[str, dict[str, Room]] = {
     "qrl_envs": {
         "specfile": Room(set(), {"pydantic"}),
         "rotation": Room(set(), MATHS),
-        "integrate": Room(set(), MATHS),
+        "fusion": Room(set(), {"jax"}),
+        "integrate": Room({"fusion"}, MATHS),
         "vehicle": Room({"specfile"}, {"pydantic", "numpy"}),
         "uncertainty": Room({"specfile"}, {"pydantic"}),
         "reference": Room({"specfile", "vehicle"}, {"pydantic", "numpy", "scipy"}),
@@ -61,7 +63,7 @@ ROOMS: dict[str, dict[str, Room]] = {
         "task": Room({"specfile", "vehicle", "uncertainty", "reference", "distribution"}, {"pydantic"}),
         "rotors": Room({"vehicle"}, MATHS),
         "pendulum": Room({"task", "integrate"}, MATHS),
-        "quadrotor": Room({"task", "vehicle", "rotation", "integrate"}, MATHS),
+        "quadrotor": Room({"task", "vehicle", "rotation", "integrate", "fusion"}, MATHS),
         "rewards": Room({"task", "quadrotor", "pendulum"}, MATHS),
         "measures": Room({"task"}, MATHS),
         "io_spec": Room({"task"}, MATHS),
@@ -74,7 +76,7 @@ ROOMS: dict[str, dict[str, Room]] = {
         "gusts": Room({"noise", "quadrotor", "sensors"}, MATHS),
         "plant": Room(
             {"task", "uncertainty", "vehicle", "quadrotor", "rotation", "rotors", "integrate", "sensors", "gusts"}
-            | {"target", "own_vehicle"},
+            | {"target", "own_vehicle", "fusion"},
             MATHS,
         ),
         "task_env": Room({"task", "symmetry"}, MATHS | {"flax.struct"}),
@@ -319,6 +321,7 @@ BROKEN = {
     "a vehicle knows its task": ("qrl_envs/vehicle.py", "from qrl_envs import task", doors, "no door"),
     "specfile": ("qrl_envs/specfile.py", "from qrl_envs import task", doors, "no door from specfile to task"),
     "rotation": ("qrl_envs/rotation.py", "from qrl_envs import integrate", doors, "no door from rotation"),
+    "fusion": ("qrl_envs/fusion.py", "from qrl_envs import rotation", doors, "no door from fusion"),
     "integrate": ("qrl_envs/integrate.py", "from qrl_envs import rotation", doors, "no door from integrate"),
     "task": ("qrl_envs/task.py", "import jax", doors, "libraries of task"),
     "pendulum": ("qrl_envs/pendulum.py", "from qrl_envs import quadrotor", doors, "no door from pendulum"),
@@ -363,7 +366,7 @@ SOUND = {
     "qrl/algorithm/types.py": "import jax\nfrom flax import struct\nfrom flax.struct import dataclass",
     "qrl/algorithm/vtrace.py": "import jax.numpy as jnp\nfrom qrl.algorithm.types import Transition",
     "qrl/algorithm/learner.py": "import optax\nfrom . import rollout\nfrom qrl.config import Config",
-    "qrl/algorithm/rollout.py": "from .. import config",
+    "qrl/algorithm/rollout.py": "from .. import config\nfrom qrl_envs.fusion import stored",
     "qrl/runs/files.py": "from qrl_envs.specfile import BadInput",
     "qrl/training/state.py": "from qrl.algorithm.learner import LearnerState",
     "qrl/training/loop.py": "from qrl.training.state import TrainState\nfrom qrl.runs import files",

@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import jax
 
+from qrl_envs.fusion import stored
+
 X = TypeVar("X", bound=Any)  # a NamedTuple with the fields pose and twist
 
 
@@ -20,7 +22,7 @@ def semi_implicit_euler(
     derivative: Callable[[X], X], x: X, dt_s: float, limit: Callable[[Any], Any] = lambda twist: twist
 ) -> X:
     """One step, first order: the twist first (then `limit`), then the pose with the new twist."""
-    twist = limit(_advance(x.twist, derivative(x).twist, dt_s))
+    twist = stored(limit(_advance(x.twist, derivative(x).twist, dt_s)))
     return x._replace(pose=_advance(x.pose, derivative(x._replace(twist=twist)).pose, dt_s), twist=twist)
 
 
@@ -28,4 +30,5 @@ def midpoint(start: Callable[[X], X], middle: Callable[[X], X], x: X, dt_s: floa
     """One step of the explicit midpoint method, second order: `start` and `middle` are the derivatives at its beginning
     and halfway, where inputs differ.
     """
-    return _advance(x, middle(_advance(x, start(x), dt_s / 2)), dt_s)
+    halfway = stored(_advance(x, start(x), dt_s / 2))
+    return _advance(x, middle(halfway), dt_s)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from qrl_envs import gusts, integrate, quadrotor, rotation, rotors, sensors
+from qrl_envs.fusion import stored
 from qrl_envs.gusts import Gust
 from qrl_envs.own_vehicle import Drawn
 from qrl_envs.quadrotor import Body, Disturbance, Physics, Pose, Twist
@@ -298,7 +299,7 @@ def advance(
 
     def thrust_at(time_s: float) -> chex.Array:
         now = speed_at(jnp.float32(time_s)) if time_s else speed
-        return world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, now)
+        return stored(world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, now))
 
     substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
     short_s = dt_s / substeps
@@ -311,7 +312,7 @@ def advance(
             short_s,
         )
         body = _renormalized(body)
-    return body, speed_at(jnp.float32(dt_s))
+    return stored((body, speed_at(jnp.float32(dt_s))))
 
 
 def commanded(world: World, action: chex.Array, rotor_speed: bool) -> tuple[chex.Array, chex.Array]:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from qrl_envs import integrate, rotation
+from qrl_envs.fusion import stored
 from qrl_envs.task import FlightStart
 from qrl_envs.vehicle import STANDARD_GRAVITY_M_S2, Vehicle
 
@@ -104,7 +105,7 @@ class Disturbance(NamedTuple):
 def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Disturbance | None = None) -> Body:
     """d(body)/dt under gravity and motor thrust [N] [N], by the Newton–Euler equations."""
     omega = body.twist.body_rate_rad_s
-    torque = _product(physics.motor_torque_m, thrust)
+    torque = stored(_product(physics.motor_torque_m, thrust))
     rotation_matrix = rotation.matrix(body.pose.attitude)
     if physics.motor_axis is None:
         acceleration = jnp.unstack(rotation_matrix, axis=1)[2] * (sum(jnp.unstack(thrust)) / physics.mass_kg)
@@ -114,7 +115,7 @@ def derivative(physics: Physics, body: Body, thrust: chex.Array, disturbance: Di
         air_speed = _product(
             jnp.swapaxes(rotation_matrix, 0, 1), body.twist.velocity_m_s - disturbance.wind_m_s
         )  # body
-        body_drag = disturbance.drag_N_s_m * air_speed
+        body_drag = stored(disturbance.drag_N_s_m * air_speed)
         drag = _product(rotation_matrix, body_drag)
         acceleration = acceleration + (disturbance.force_N - drag) / physics.mass_kg
         x, y, z = jnp.unstack(disturbance.drag_height_m * body_drag)  # torque about the center of mass: height × −drag

@@ -123,6 +123,9 @@ class TaskEnv(abc.ABC):
         """One control period under `action` [A], clipped to [−1, 1]; differentiable in state and action, not in the
         task's parameters, which are constants of a flight.
         """
+        return self._stepped(state, action, self._observe)
+
+    def _stepped(self, state: State, action: chex.Array, observe: Callable[[Params, Any], chex.Array]) -> State:
         lane: Lane = state.pipeline_state
         given, lane = lane, lane._replace(params=jax.lax.stop_gradient(lane.params))
         x, reward = self._advance(lane.params, lane.x, action)
@@ -130,7 +133,7 @@ class TaskEnv(abc.ABC):
         reward, done = jnp.where(out, self._reward_out_of_bounds(lane.params), reward), out.astype(jnp.float32)
         return state.replace(
             pipeline_state=Lane(x, given.params),
-            obs=self._observe(lane.params, x),
+            obs=observe(lane.params, x),
             reward=reward,
             done=done,
             info={**state.info, "truncated": done, "out_of_bounds": done},
@@ -141,7 +144,8 @@ class TaskEnv(abc.ABC):
 
         What a subclass computes (`_advance`, `_observe`, …) is for one lane, or for any axes behind those of one.
         """
-        return self.step(state, action)
+        # Made lane by lane: so its transposition, which networks read, takes no operation of its own.
+        return self._stepped(state, action, jax.vmap(self._observe, in_axes=-1, out_axes=-1))
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         """The random symmetry of the task that u [2] selects, uniform in [0, 1)."""

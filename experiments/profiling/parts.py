@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from qrl.algorithm import augmentation, learner, replay_buffer, rollout
+from qrl.algorithm.carried import lanes_last
 from qrl.algorithm.types import Networks, Transition
 from qrl.algorithm.vtrace import vtrace
 from qrl.training.state import MemberInputs, TrainState
@@ -139,7 +140,8 @@ def step_physics(trainer: Trainer, call: Call) -> Any:
 def draw_starts(trainer: Trainer, call: Call) -> Any:
     over, lanes = jnp.ones(trainer.config.num_envs, bool), call.inputs.state.lanes
     lanes = lanes._replace(done=over, next_state_used=over, reset_count=lanes.reset_count + call.i)
-    return rollout.restart(trainer.setup.env, lanes, call.inputs.state.start_key)
+    steps = rollout.Steps(trainer.setup.env, lanes)
+    return steps.restart(steps.pack(lanes), lanes_last(lanes.state), call.inputs.state.start_key)
 
 
 # -- from an unroll to minibatches ---------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from scipy import stats
 
 from qrl.algorithm import rollout
 from qrl.algorithm.adapter import adapt
+from qrl.algorithm.carried import lanes_last
 from qrl.algorithm.rollout import Lanes
 from qrl.algorithm.types import Transition
 from qrl.config import Config
@@ -265,8 +266,9 @@ class Keeping(Fenced):
         return super().at(x).replace(info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        after = super().step(state, action)
-        return after.replace(info=state.info | {"age": state.info["age"] + 1.0})
+        after, info = super().step(state, action), state.info
+        reward = after.reward + info["mass"] + info["swapped"] + info["drawn"] + info["age"]
+        return after.replace(reward=reward, info=info | {"age": info["age"] + 1.0})
 
     def restart(self, state: State, rng: jax.Array) -> State:
         info = state.info | {"drawn": jax.random.uniform(rng), "swapped": state.info["mass"]}
@@ -283,12 +285,16 @@ def test_a_restart_leaves_alone_what_it_and_a_step_hand_on(jitted: bool) -> None
     mass = jnp.arange(LANES, dtype=jnp.float32)
     info = lanes.state.info | {"mass": mass, "age": mass}
     lanes = lanes._replace(state=lanes.state.replace(info=info), done=jnp.arange(LANES) % 2 == 0)
-    kept = rollout._kept(adapt(env), lanes.state).info
-    assert [name for name, value in kept.items() if value] == ["empty", "mass"]
     if jitted:
         env.restart = jax.jit(env.restart)
-        assert not any(jax.tree.leaves(rollout._kept(adapt(env), lanes.state)))
-    once = rollout.restart(adapt(env), lanes, jax.random.key(1))
+    steps = rollout.Steps(adapt(env), lanes)
+    carry = steps.pack(lanes).state
+    # A step changes the state [5] and the age; a restart "drawn" and "swapped" and, jitted, perhaps "mass". No later
+    # step asks for the rest.
+    assert carry.moving.shape == (6, LANES)
+    assert carry.drawn.shape == (3 if jitted else 2, LANES)
+    once = steps.restart(steps.pack(lanes), lanes_last(lanes.state), jax.random.key(1))
+    once = steps.unpack(once, lanes)
     np.testing.assert_array_equal(once.state.info["mass"], mass)
     np.testing.assert_array_equal(once.state.info["swapped"], np.where(lanes.done, mass, lanes.state.info["swapped"]))
     np.testing.assert_array_equal(once.state.info["age"], mass)
@@ -304,7 +310,7 @@ def test_a_restart_of_another_structure_is_refused() -> None:
 
     lanes = begin_of(Keeping())(jax.random.key(0))
     with pytest.raises(ValueError, match=r"restart gives a state of another structure: expected .*mass.*, found"):
-        rollout.restart(adapt(Another()), lanes, jax.random.key(1))
+        rollout.Steps(adapt(Another()), lanes)
 
 
 def test_an_environment_without_the_mark_only_terminates(flight: Flight) -> None:

@@ -69,7 +69,7 @@ def test_parameters_and_a_flights_world_are_constant() -> None:
     states = jax.jit(jax.vmap(world.reset, out_axes=-1))(jax.random.split(jax.random.PRNGKey(0), 3))
     carried = Carried(world.step_lanes, states, jnp.zeros((4, 3)), lambda state: (state.obs, state.reward, state.done))
     moved = jax.tree.map(lambda x: x + 1, states)
-    lane, first, later = (x.pipeline_state for x in (carried.unpack(carried.pack(moved)), states, moved))
+    lane, first, later = (x.pipeline_state for x in (carried.unpack(carried.pack(moved), states), states, moved))
     for ours, expected in ((lane.params, first.params), (lane.x.world, first.x.world)):
         assert all(x is y for x, y in zip(jax.tree.leaves(ours), jax.tree.leaves(expected), strict=True))
     for name in ("body", "speed", "integral_m_s"):

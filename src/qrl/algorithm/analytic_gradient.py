@@ -13,35 +13,44 @@ import jax.numpy as jnp
 
 from qrl.algorithm import learner
 from qrl.algorithm.adapter import adapt
-from qrl.algorithm.carried import Carried
+from qrl.algorithm.carried import Carried, Carry
 from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
 from qrl.algorithm.types import Env, State, info_flag
 from qrl.config import Hyperparameters
+from qrl_envs.fusion import stored
 
 # memory [n, H] or (), what a policy sees [n, I] -> next memory, mean actions [n, A]
 Act = Callable[[Any, chex.Array], tuple[Any, chex.Array]]
 
 
 @jax.custom_vjp
-def _bounded(tree: chex.ArrayTree, limit: chex.Array) -> chex.ArrayTree:
-    """`tree`, with last axis n; on the way back the norm of each of the n cotangents is at most `limit`."""
+def _bounded(carry: Carry, memory: Any, limit: chex.Array) -> tuple[Carry, Any]:
+    """Both as they are; on the way back the norm of the cotangent of each of the n flights is at most `limit`."""
     del limit
-    return tree
+    return carry, memory
 
 
-def _bounded_forward(tree: chex.ArrayTree, limit: chex.Array) -> tuple[chex.ArrayTree, chex.Array]:
-    return tree, limit
+def _bounded_forward(carry: Carry, memory: Any, limit: chex.Array) -> tuple[tuple[Carry, Any], chex.Array]:
+    return (carry, memory), limit
 
 
-def _bounded_backward(limit: chex.Array, cotangent: chex.ArrayTree) -> tuple[chex.ArrayTree, None]:
-    leaves = [x for x in jax.tree.leaves(cotangent) if x.dtype != jax.dtypes.float0]
-    square = jnp.sum(jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in leaves]) ** 2, axis=0)
-    factor = jnp.where(jnp.isfinite(square), jnp.minimum(1.0, limit * jax.lax.rsqrt(square + 1e-20)), 0.0)
+def _bounded_backward(limit: chex.Array, cotangents: tuple[Carry, Any]) -> tuple[Carry, Any, None]:
+    carry, memory = cotangents
 
-    def scaled(x: chex.Array) -> chex.Array:
+    def square(x: chex.Array, lanes: int) -> chex.Array | float:
+        if x.dtype == jax.dtypes.float0:
+            return 0.0
+        return jnp.sum(x * x, axis=[axis for axis in range(x.ndim) if axis != lanes % x.ndim])
+
+    whole = sum(square(x, 0) for x in jax.tree.leaves((carry.observation, memory)))
+    whole = whole + sum(square(x, -1) for x in jax.tree.leaves(carry[1:]))
+    factor = jnp.where(jnp.isfinite(whole), jnp.minimum(1.0, limit * jax.lax.rsqrt(whole + 1e-20)), 0.0)
+
+    def scaled(x: chex.Array, factor: chex.Array) -> chex.Array:
         return x if x.dtype == jax.dtypes.float0 else jnp.where(factor > 0.0, x * factor, 0.0)
 
-    return jax.tree.map(scaled, cotangent), None
+    memory = jax.tree.map(lambda x: scaled(x, factor[:, None]), memory)
+    return jax.tree.map(scaled, carry, carry.each(factor)), memory, None
 
 
 _bounded.defvjp(_bounded_forward, _bounded_backward)
@@ -80,24 +89,23 @@ def returns(
     # Flights lie along the last axis: so a CPU takes vectors of them.
     states, noise = jax.vmap(one, out_axes=-1)(keys)
     states = seen_of(states)
-    carried = Carried(step_of, states, noise[0], _wanted)
+    carried = Carried(step_of, states, noise[0], _wanted, _wanted)
 
-    def step(carry: tuple[Any, Any, chex.Array], noise: chex.Array) -> tuple[tuple[Any, Any, chex.Array], Any]:
-        packed, memory, alive = carry
-        state = carried.unpack(packed)
-        memory, mean = policy(jax.tree.map(jnp.transpose, memory), state.obs.T)
-        memory = jax.tree.map(jnp.transpose, memory)
-        after = step_of(state, jnp.clip(mean.T + sigma * noise, -1.0, 1.0))
+    def step(now: tuple[Carry, Any, chex.Array], noise: chex.Array) -> tuple[tuple[Carry, Any, chex.Array], Any]:
+        carry, memory, alive = now
+        state = carried.unpack(carry, states)
+        memory, mean = policy(memory, carry.observation)
+        after = step_of(state, stored(jnp.clip(mean.T + sigma * noise, -1.0, 1.0)))
         charge = jnp.where(info_flag(state, "out_of_bounds"), state.reward, jnp.minimum(state.reward, 0.0))
         reward = jnp.where(alive > 0, after.reward, charge)
-        packed = jax.tree.map(lambda new, old: jnp.where(alive > 0, new, old), carried.pack(after), packed)
+        carry = jax.tree.map(jnp.where, carry.each(alive > 0), carried.follow(carry, after), carry)
         if cotangent_norm is not None:
             # The observation too: through it alone the next action depends on this one.
-            packed, memory = _bounded((packed, memory), cotangent_norm)
-        return (packed, memory, alive * (1.0 - after.done)), reward
+            carry, memory = _bounded(carry, memory, cotangent_norm)
+        return (carry, memory, alive * (1.0 - after.done)), reward
 
     # Rematerialize each step in the backward pass: the intermediate values of all steps would not fit a CPU's cache.
-    first = carried.pack(states), jax.tree.map(jnp.transpose, memory), jnp.ones_like(states.reward)
+    first = carried.pack(states), memory, jnp.ones_like(states.reward)
     (_, _, alive), rewards = jax.lax.scan(jax.checkpoint(step), first, noise)
     return jnp.sum(rewards, axis=0), alive > 0
 

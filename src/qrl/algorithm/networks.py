@@ -63,10 +63,12 @@ class GRU(nn.Module):
 
     def remember(self, memory: chex.Array, gates: chex.Array) -> chex.Array:
         """The next memory; [..., H], [..., 3H] -> [..., H]."""
-        both = 2 * self.units
-        own = self.of_memory(memory)
-        r, z = jnp.split(nn.sigmoid(gates[..., :both] + own[..., :both]), 2, axis=-1)
-        n = jnp.tanh(gates[..., both:] + r * (own[..., both:] + self.candidate_bias))
+        # Split, not sliced: the gradient is one concatenation, that of slices a sum of padded arrays.
+        sizes = 2 * self.units, self.units
+        given, given_n = jax.lax.split(gates, sizes, axis=gates.ndim - 1)
+        own, own_n = jax.lax.split(self.of_memory(memory), sizes, axis=memory.ndim - 1)
+        r, z = jnp.split(nn.sigmoid(given + own), 2, axis=-1)
+        n = jnp.tanh(given_n + r * (own_n + self.candidate_bias))
         return z * memory + (1.0 - z) * n
 
     def output(self, memory: chex.Array) -> chex.Array:

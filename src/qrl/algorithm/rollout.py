@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import threefry_2x32
 
+from qrl.algorithm.carried import Carried, Carry, lanes_first, lanes_last
 from qrl.algorithm.networks import log_density
 from qrl.algorithm.types import State, TaskEnv, Transition, info_flag
+from qrl_envs.fusion import stored
 
 BLOCK_LANES = 512  # most lanes stepped at a time on a CPU: with more, what passes between steps leaves its cache
 
@@ -28,10 +30,10 @@ class Lanes(NamedTuple):
     """
 
     lane_id: chex.Array  # [N] int32 among all lanes of the run
-    state: State
+    state: Any  # a State; where no later step depends on a leaf, it may be that of an earlier step
     steps: chex.Array  # [N] int32 into the episode
     done: chex.Array  # [N] bool: the episode is over; the lane restarts before its next step
-    next_state: State  # [N] each lane's next start
+    next_state: Any  # a State [N]: each lane's next start
     reset_count: chex.Array  # [N] int32: which of its starts that is
     next_state_used: chex.Array  # [N] bool
     num_early: chex.Array  # [N] int32: episodes so far that ended before their last step
@@ -41,7 +43,7 @@ class Lanes(NamedTuple):
 class UnrollCarry(NamedTuple):
     """The lanes between two steps of an unroll; leading axis N everywhere."""
 
-    lanes: Lanes
+    lanes: Lanes  # `state` and `next_state` as they are carried
     truncated: chex.Array  # [N] bool: the last step of this unroll ended an episode that is bootstrapped
     found: chex.Array  # [N] bool: an earlier one did
     final_observation: chex.Array  # [N, F] after the first that did
@@ -54,7 +56,7 @@ def _first_truncation(now: UnrollCarry) -> chex.Array:
 
 def _record_final(now: UnrollCarry) -> UnrollCarry:
     first = _first_truncation(now)
-    final = jnp.where(first[:, None], now.lanes.state.obs, now.final_observation)
+    final = jnp.where(first[:, None], now.lanes.state.observation, now.final_observation)
     return now._replace(found=now.found | first, final_observation=final)
 
 
@@ -82,50 +84,71 @@ def _start_keys(key: chex.PRNGKey, lane_id: chex.Array, reset_count: chex.Array)
     return jax.vmap(lambda n, s: jax.random.fold_in(jax.random.fold_in(key, n), s))(lane_id, reset_count)
 
 
-def restart(env: TaskEnv, lanes: Lanes, key: chex.PRNGKey) -> Lanes:
-    """Put lanes whose episode is over at their next start, with a memory of zeros; the others stay as they are.
+class Steps:
+    """The steps and restarts of a batch of lanes, whose states are carried (`carried.Carried`)."""
 
-    Starts are drawn for all lanes at once, and only when some lane has used its own: drawn at every step they would
-    cost many times the physics. A lane that has not gets the same start again.
-    """
-    kept = _kept(env, lanes.state)
+    def __init__(self, env: TaskEnv, lanes: Lanes) -> None:
+        """Of lanes [n, ...]; only their shapes are read. Raises ValueError for a step or restart whose states have
+        another structure.
+        """
+        self._env = env
+        states = jax.tree.map(lambda x: jax.ShapeDtypeStruct((*x.shape[1:], x.shape[0]), x.dtype), lanes.state)
+        action = jax.ShapeDtypeStruct((env.action_size, *lanes.done.shape), jnp.float32)
+        key = jax.random.PRNGKey(0)
+        self._carried = Carried(env.step_lanes, states, action, _results, restart=lambda state: env.restart(state, key))
 
-    def draw(lanes: Lanes) -> Lanes:
-        reset_count = lanes.reset_count + lanes.next_state_used
-        next_state = jax.vmap(env.restart)(lanes.state, _start_keys(key, lanes.lane_id, reset_count))
-        unused = jnp.zeros_like(lanes.next_state_used)
-        return lanes._replace(next_state=next_state, reset_count=reset_count, next_state_used=unused)
+    def pack(self, lanes: Lanes) -> Lanes:
+        """Lanes with what is carried of their states."""
+        state, next_state = (self._carried.pack(lanes_last(each)) for each in (lanes.state, lanes.next_state))
+        return lanes._replace(state=state, next_state=next_state)
 
-    lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes, cheap=False)
+    def unpack(self, lanes: Lanes, before: Lanes) -> Lanes:
+        """Lanes with whole states; what is not carried of them is that of the lanes `before`."""
+        state, next_state = (
+            lanes_first(self._carried.unpack(carry, lanes_last(constant)))
+            for carry, constant in ((lanes.state, before.state), (lanes.next_state, before.next_state))
+        )
+        return lanes._replace(state=state, next_state=next_state)
 
-    def pick(kept: bool, new: chex.Array, old: chex.Array) -> chex.Array:
-        return old if kept else jnp.where(lanes.done.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+    def restart(self, lanes: Lanes, constant: State, key: chex.PRNGKey) -> Lanes:
+        """Put lanes whose episode is over at their next start, with a memory of zeros; the others stay as they are.
 
-    return lanes._replace(
-        state=jax.tree.map(pick, kept, lanes.next_state, lanes.state),
-        steps=jnp.where(lanes.done, 0, lanes.steps),
-        done=jnp.zeros_like(lanes.done),
-        next_state_used=lanes.next_state_used | lanes.done,
-        memory=jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory),
-    )
+        Starts are drawn for all lanes at once, and only when some lane has used its own: drawn at every step they
+        would cost many times the physics. A lane that has not gets the same start again.
+        """
+
+        def draw(lanes: Lanes) -> Lanes:
+            reset_count = lanes.reset_count + lanes.next_state_used
+            states = self._carried.unpack(lanes.state, constant)
+            keys = _start_keys(key, lanes.lane_id, reset_count)
+            starts = jax.vmap(self._env.restart, in_axes=(-1, 0), out_axes=-1)(states, keys)
+            # Stored, or XLA would lay starts out lane by lane, and turn them at every step.
+            next_state = stored(self._carried.pack(starts))
+            unused = jnp.zeros_like(lanes.next_state_used)
+            return lanes._replace(next_state=next_state, reset_count=reset_count, next_state_used=unused)
+
+        lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes, cheap=False)
+        return lanes._replace(
+            state=jax.tree.map(jnp.where, lanes.state.each(lanes.done), lanes.next_state, lanes.state),
+            steps=jnp.where(lanes.done, 0, lanes.steps),
+            done=jnp.zeros_like(lanes.done),
+            next_state_used=lanes.next_state_used | lanes.done,
+            memory=jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory),
+        )
+
+    def step(self, carry: Carry, constant: State, action: chex.Array) -> tuple[Carry, State]:
+        """What is carried after a step under the actions [n, A], clipped to [−1, 1]; and the states, lanes last."""
+        states = self._carried.unpack(carry, constant)
+        after = self._env.step_lanes(states, stored(jnp.clip(action, -1.0, 1.0).T))
+        return self._carried.follow(carry, after), after
 
 
-def _kept(env: TaskEnv, states: State) -> Any:
-    """Of each leaf of the states [N, ...], whether neither a step nor a restart changes it: a lane's own parameters.
+def _results(state: State) -> Any:
+    """What `_step` takes of the states that a step gives."""
+    return state.obs, state.reward, state.done, [state.info.get(name) for name in FLAGS]
 
-    Raises ValueError if a restart gives a state of another structure.
-    """
-    state = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), states)
-    action, key = jax.ShapeDtypeStruct((env.action_size,), jnp.float32), jax.random.PRNGKey(0)
-    structure, kept = jax.tree.structure(state), [True] * len(jax.tree.leaves(state))
-    for name, after in (("step", env.step), ("restart", lambda state, _: env.restart(state, key))):
-        program, result = jax.make_jaxpr(after, return_shape=True)(state, action)
-        if jax.tree.structure(result) != structure:
-            found, expected = jax.tree.structure(result), structure
-            raise ValueError(f"{name} gives a state of another structure: expected {expected}, found {found}")
-        before = program.jaxpr.invars
-        kept = [k and old is new for k, old, new in zip(kept, before, program.jaxpr.outvars, strict=False)]
-    return jax.tree.unflatten(structure, kept)
+
+FLAGS = "truncated", "truncation", "out_of_bounds"  # of `info`
 
 
 def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any], values: Any, cheap: bool) -> Any:
@@ -143,47 +166,49 @@ Policy = Callable[[Any, chex.Array], tuple[Any, chex.Array]]  # (memory, observa
 
 
 def _step(
-    env: TaskEnv,
+    steps: Steps,
     policy: Policy,
     sigma: chex.Array,
     start_key: chex.PRNGKey,
     max_episode_steps: int,
+    constant: State,
     now: UnrollCarry,
     noise: chex.Array,
 ) -> tuple[UnrollCarry, Transition]:
     """One step of the lanes [n] with the noise [n, A], after the restart of those whose episode is over; its
-    transitions [n, ...], without final observations and memory.
+    transitions [n, ...], without final observations and memory. `constant` has what is not carried of the states.
     """
 
     def restart_done_lanes(now: UnrollCarry) -> UnrollCarry:
         found = _at_most_once(lambda now: jnp.any(_first_truncation(now)), _record_final, now, cheap=True)
-        return found._replace(lanes=restart(env, now.lanes, start_key))
+        return found._replace(lanes=steps.restart(now.lanes, constant, start_key))
 
     now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_done_lanes, now, cheap=True)
     lanes = now.lanes
-    observation = lanes.state.obs
+    observation = lanes.state.observation
     memory, center = policy(lanes.memory, observation)
     action = center + sigma * noise
-    state = jax.vmap(env.step)(lanes.state, jnp.clip(action, -1.0, 1.0))
-    steps = lanes.steps + 1
-    ended = state.done.astype(bool)
-    out_of_bounds = info_flag(state, "out_of_bounds")
-    truncated = info_flag(state, "truncated") | info_flag(state, "truncation") | out_of_bounds
+    carry, state = steps.step(lanes.state, constant, action)
+    age = lanes.steps + 1
+    # What an environment gives as a constant has no lanes.
+    ended = jnp.broadcast_to(state.done.astype(bool), age.shape)
+    out_of_bounds = ended & info_flag(state, "out_of_bounds")
+    truncated = ended & (info_flag(state, "truncated") | info_flag(state, "truncation")) | out_of_bounds
     terminated = ended & ~truncated
-    done = ended | (steps >= max_episode_steps)
+    done = ended | (age >= max_episode_steps)
     transition = Transition(
         observation=observation,
         action=action,
         log_mu=log_density(action, center, sigma),
-        reward=state.reward,
+        reward=jnp.broadcast_to(state.reward, age.shape),
         terminated=terminated.astype(jnp.float32),
         truncated=(done & ~terminated).astype(jnp.float32),
-        out_of_bounds=(ended & out_of_bounds).astype(jnp.float32),
+        out_of_bounds=out_of_bounds.astype(jnp.float32),
         final_observation=(),
     )
-    num_early = lanes.num_early + (ended & (steps < max_episode_steps))
-    after = lanes._replace(state=state, steps=steps, done=done, num_early=num_early, memory=memory)
-    return now._replace(lanes=after, truncated=done & ~terminated & ~(ended & out_of_bounds)), transition
+    num_early = lanes.num_early + (ended & (age < max_episode_steps))
+    after = lanes._replace(state=carry, steps=age, done=done, num_early=num_early, memory=memory)
+    return now._replace(lanes=after, truncated=done & ~terminated & ~out_of_bounds), transition
 
 
 def unroll(
@@ -205,12 +230,18 @@ def unroll(
     "truncated", "out_of_bounds"), else `terminated`. `noise_key` is this unroll's own; `start_key` is that of `init`.
     """
 
+    count = lanes.lane_id.shape[0]
+    num_blocks = _num_blocks(count)
+    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, count // num_blocks, *x.shape[1:]), lanes)
+    first = jax.tree.map(lambda x: x[0], blocks)
+    steps = Steps(env, first)
     # Jitted, so that it is traced once for its shapes and for the loop.
-    step = jax.jit(functools.partial(_step, env, policy, sigma, start_key, max_episode_steps), inline=True)
+    step = jax.jit(functools.partial(_step, steps, policy, sigma, start_key, max_episode_steps), inline=True)
 
-    def begin(lanes: Lanes) -> UnrollCarry:
-        none = jnp.zeros_like(lanes.done)
-        return UnrollCarry(lanes, truncated=none, found=none, final_observation=jnp.zeros_like(lanes.state.obs))
+    def begin(lanes: Lanes) -> tuple[State, UnrollCarry]:
+        none, packed = jnp.zeros_like(lanes.done), steps.pack(lanes)
+        final = jnp.zeros_like(packed.state.observation)
+        return lanes_last(lanes.state), UnrollCarry(packed, truncated=none, found=none, final_observation=final)
 
     def unroll_block(record: Transition, block: tuple[chex.Array, Lanes]) -> tuple[Transition, Any]:
         """T steps of the lanes of one block [n], written into the record of all in place."""
@@ -220,22 +251,20 @@ def unroll(
 
         def write_step(carry: tuple[UnrollCarry, Transition], at: tuple[chex.Array, chex.Array]) -> tuple[Any, None]:
             (now, record), (t, noise) = carry, at
-            now, transition = step(now, noise)
+            now, transition = step(constant, now, noise)
             return (now, jax.tree.map(functools.partial(_write, index, t), record, transition)), None
 
         noise = normal(noise_key, lanes.lane_id, unroll_length, env.action_size)
         times = jnp.arange(unroll_length), noise
-        (last, record), _ = jax.lax.scan(write_step, (begin(lanes), record), times)
+        constant, now = begin(lanes)
+        (last, record), _ = jax.lax.scan(write_step, (now, record), times)
         bootstrapped = last.truncated | ~last.lanes.done
-        final = jnp.where(bootstrapped[:, None], last.lanes.state.obs, 0.0)
-        return record, (last.lanes, jnp.stack([last.final_observation, final], axis=1), memory)
+        final = jnp.where(bootstrapped[:, None], last.lanes.state.observation, 0.0)
+        after = steps.unpack(last.lanes, lanes)
+        return record, (after, jnp.stack([last.final_observation, final], axis=1), memory)
 
-    count = lanes.lane_id.shape[0]
-    num_blocks = _num_blocks(count)
-    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, count // num_blocks, *x.shape[1:]), lanes)
-    first = jax.tree.map(lambda x: x[0], blocks)
     noise = jnp.zeros((count // num_blocks, env.action_size))
-    of_step = jax.eval_shape(step, begin(first), noise)[1]
+    of_step = jax.eval_shape(step, *begin(first), noise)[1]
     lead = num_blocks, count // num_blocks, unroll_length
     record = jax.tree.map(lambda x: jnp.zeros((*lead, *x.shape[1:]), x.dtype), of_step)
     record, after = jax.lax.scan(unroll_block, record, (jnp.arange(num_blocks), blocks))
