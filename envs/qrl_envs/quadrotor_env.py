@@ -1,7 +1,6 @@
 """The tasks of a vehicle as environments: of an ideal plant, and of a real one."""
 
 import copy
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import chex
@@ -148,8 +147,8 @@ class RealQuadrotorEnv(QuadrotorEnv):
     def _target(self, world: plant.World, steps: chex.Array) -> Target | None:
         return self._reference.at(world.reference, steps) if self._reference else None
 
-    def _stepped(self, state: State, action: chex.Array, observe: Callable[[Params, Any], chex.Array]) -> State:
-        return self._with_truth(super()._stepped(state, action, observe))
+    def step(self, state: State, action: chex.Array) -> State:
+        return self._with_truth(super().step(state, action))
 
     def _reset(self, params: Any, rng: chex.PRNGKey) -> State:
         return self._with_truth(super()._reset(params, rng))

@@ -123,14 +123,13 @@ class TaskEnv(abc.ABC):
         """One control period under `action` [A], clipped to [−1, 1]; differentiable in state and action, not in the
         task's parameters, which are constants of a flight.
         """
-        return self._stepped(state, action, self._observe)
-
-    def _stepped(self, state: State, action: chex.Array, observe: Callable[[Params, Any], chex.Array]) -> State:
         lane: Lane = state.pipeline_state
         given, lane = lane, lane._replace(params=jax.lax.stop_gradient(lane.params))
         x, reward = self._advance(lane.params, lane.x, action)
         out = self._out_of_bounds(lane.params, x)
         reward, done = jnp.where(out, self._reward_out_of_bounds(lane.params), reward), out.astype(jnp.float32)
+        # Of many lanes each by itself: so its transposition, which networks read, takes no operation of its own.
+        observe = self._observe if action.ndim == 1 else jax.vmap(self._observe, in_axes=-1, out_axes=-1)
         return state.replace(
             pipeline_state=Lane(x, given.params),
             obs=observe(lane.params, x),
@@ -144,8 +143,7 @@ class TaskEnv(abc.ABC):
 
         What a subclass computes (`_advance`, `_observe`, …) is for one lane, or for any axes behind those of one.
         """
-        # Made lane by lane: so its transposition, which networks read, takes no operation of its own.
-        return self._stepped(state, action, jax.vmap(self._observe, in_axes=-1, out_axes=-1))
+        return self.step(state, action)
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         """The random symmetry of the task that u [2] selects, uniform in [0, 1)."""

@@ -14,7 +14,7 @@ LANES, STEPS = 3, 4
 
 
 class State(NamedTuple):
-    """`obs` depends on `late`, `count` and `gain`, and the reward on `debt`; `seen` is what nobody asks for."""
+    """`obs` depends on `late`, `count` and `gain`, the reward on `debt`, a restart on `wish`; nobody asks `seen`."""
 
     obs: jax.Array
     late: jax.Array
@@ -22,6 +22,7 @@ class State(NamedTuple):
     count: jax.Array
     gain: jax.Array
     debt: jax.Array
+    wish: jax.Array
     reward: jax.Array
     seen: jax.Array
 
@@ -30,17 +31,17 @@ def step(state: State, action: jax.Array) -> State:
     count = state.count + 1
     obs = state.obs + state.gain * state.late * count + action
     reward = jnp.sum(state.obs, axis=0) - state.debt
-    return State(obs, state.soon, action, count, state.gain, state.debt + count, reward, state.obs * 2.0)
+    return State(obs, state.soon, action, count, state.gain, state.debt + count, obs[0], reward, state.obs * 2.0)
 
 
 def restart(state: State) -> State:
-    """Draws the gain."""
-    return state._replace(gain=jnp.ones(2), obs=jnp.zeros(2))
+    """Draws the gain, as was wished."""
+    return state._replace(gain=state.wish * jnp.ones(2), obs=jnp.zeros(2))
 
 
 def states() -> State:
     rows, one = jnp.arange(2.0 * LANES).reshape(2, LANES), jnp.arange(1.0 * LANES)
-    return State(rows, rows + 1.0, rows + 2.0, jnp.zeros(LANES, jnp.int32), rows + 3.0, one, one, rows)
+    return State(rows, rows + 1.0, rows + 2.0, jnp.zeros(LANES, jnp.int32), rows + 3.0, one, one, one, rows)
 
 
 def results(state: State) -> Any:
@@ -57,7 +58,8 @@ def test_a_loop_carries_what_a_later_step_needs_and_no_more(restarts: bool, want
     carried = Carried(step, first, action, results, asked, restart if restarts else None)
     carry = carried.pack(first)
     np.testing.assert_array_equal(carry.observation, first.obs.T)
-    moving = [first.late, first.soon, first.debt[None], *([first.reward[None]] if wanted else [])]
+    moving = [first.late, first.soon, first.debt[None]]
+    moving += [first.wish[None]] * restarts + [first.reward[None]] * wanted
     np.testing.assert_array_equal(carry.moving, jnp.concatenate(moving))
     np.testing.assert_array_equal(carry.drawn, first.gain if restarts else np.zeros((0, LANES)))
     np.testing.assert_array_equal(carry.others, [first.count])
@@ -67,7 +69,7 @@ def test_a_loop_carries_what_a_later_step_needs_and_no_more(restarts: bool, want
         np.testing.assert_array_equal(after.reward, whole.reward)
         carry = carried.follow(carry, after)
     found = carried.unpack(carry, first)
-    for name in ("obs", "late", "soon", "count", "gain", "debt", *(["reward"] if wanted else [])):
+    for name in ("obs", "late", "soon", "count", "gain", "debt", *["wish"] * restarts, *["reward"] * wanted):
         np.testing.assert_array_equal(getattr(found, name), getattr(whole, name))
     assert found.seen is first.seen
 

@@ -12,6 +12,7 @@ import pytest
 from qrl.algorithm.carried import Carried
 from qrl_envs import task
 from qrl_envs.env import from_task
+from qrl_envs.pendulum_env import PendulumEnv
 from qrl_envs.quadrotor_env import RealQuadrotorEnv
 
 CASES = [
@@ -60,6 +61,18 @@ def test_lanes_along_the_last_axis_step_as_each_by_itself(name: str, vehicle: st
     np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-5 * float(jnp.abs(wanted).max()))
     for x, y in zip(jax.tree.leaves(after_lanes), jax.tree.leaves(after_each), strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
+
+
+def test_lanes_step_as_a_subclass_says() -> None:
+    class Lighter(PendulumEnv):
+        def step(self, state: Any, action: jax.Array) -> Any:
+            return super().step(state, action / 2)
+
+    plain, lighter = (kind(task.load("pendulum")) for kind in (PendulumEnv, Lighter))
+    states = jax.vmap(plain.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 3))
+    actions = jnp.array([[0.5, -1.0, 0.2]])
+    found, expected = lighter.step_lanes(states, actions), plain.step_lanes(states, actions / 2)
+    np.testing.assert_array_equal(found.obs, expected.obs)
 
 
 def test_parameters_and_a_flights_world_are_constant() -> None:
