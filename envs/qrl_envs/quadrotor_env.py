@@ -150,6 +150,9 @@ class RealQuadrotorEnv(QuadrotorEnv):
     def step(self, state: State, action: chex.Array) -> State:
         return self._with_truth(super().step(state, action))
 
+    def step_lanes(self, state: State, action: chex.Array) -> State:
+        return super().step_lanes(state, action)  # `step` above is for many lanes, too
+
     def _reset(self, params: Any, rng: chex.PRNGKey) -> State:
         return self._with_truth(super()._reset(params, rng))
 

@@ -128,22 +128,40 @@ class TaskEnv(abc.ABC):
         x, reward = self._advance(lane.params, lane.x, action)
         out = self._out_of_bounds(lane.params, x)
         reward, done = jnp.where(out, self._reward_out_of_bounds(lane.params), reward), out.astype(jnp.float32)
-        # Of many lanes each by itself: so its transposition, which networks read, takes no operation of its own.
-        observe = self._observe if action.ndim == 1 else jax.vmap(self._observe, in_axes=-1, out_axes=-1)
         return state.replace(
             pipeline_state=Lane(x, given.params),
-            obs=observe(lane.params, x),
+            obs=self._observation(lane.params, x, action.shape[1:]),
             reward=reward,
             done=done,
             info={**state.info, "truncated": done, "out_of_bounds": done},
         )
 
+    def _observation(self, params: Params, x: Any, lanes: tuple[int, ...]) -> chex.Array:
+        """The observation [F], or [F, n] of n lanes."""
+        if not lanes:
+            return self._observe(params, x)
+        # Each by itself: so its transposition, which networks read, takes no operation of its own.
+        given = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, lanes) if jnp.ndim(leaf) == 0 else leaf, (params, x))
+        return jax.vmap(self._observe, in_axes=-1, out_axes=-1)(*given)
+
     def step_lanes(self, state: State, action: chex.Array) -> State:
         """`step` of many lanes, which lie along the last axis of every leaf: so a CPU takes vectors of lanes.
 
-        What a subclass computes (`_advance`, `_observe`, …) is for one lane, or for any axes behind those of one.
+        What a subclass computes (`_advance`, `_out_of_bounds`, …) is for one lane, or for any axes behind those of one;
+        `_observe` and a `step` of its own are for one lane.
         """
+        if self._steps_one_lane():
+            return jax.vmap(self.step, in_axes=-1, out_axes=-1)(state, action)
         return self.step(state, action)
+
+    def _steps_one_lane(self) -> bool:
+        """Whether `step` was overridden without `step_lanes`: then it may sum over what would be lanes."""
+        for names in (vars(self), *map(vars, type(self).__mro__)):
+            if "step_lanes" in names:
+                return False
+            if "step" in names:
+                return True
+        return False
 
     def symmetry(self, u: chex.Array) -> Symmetry:
         """The random symmetry of the task that u [2] selects, uniform in [0, 1)."""

@@ -1,6 +1,7 @@
 """`step_lanes`: many lanes along the last axis of every leaf."""
 
 import json
+import types
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ import pytest
 from qrl.algorithm.carried import Carried
 from qrl_envs import task
 from qrl_envs.env import from_task
-from qrl_envs.pendulum_env import PendulumEnv
 from qrl_envs.quadrotor_env import RealQuadrotorEnv
 
 CASES = [
@@ -63,16 +63,28 @@ def test_lanes_along_the_last_axis_step_as_each_by_itself(name: str, vehicle: st
         np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-5)
 
 
-def test_lanes_step_as_a_subclass_says() -> None:
-    class Lighter(PendulumEnv):
-        def step(self, state: Any, action: jax.Array) -> Any:
-            return super().step(state, action / 2)
+@pytest.mark.parametrize(("name", "vehicle"), [("pendulum", None), ("hover", None), ("hover", "crazyflie")])
+@pytest.mark.parametrize("of", ["class", "instance"])
+def test_lanes_step_as_a_subclass_says(name: str, vehicle: str | None, of: str) -> None:
+    """Its step is for one lane: it sums over actions, and gives a leaf without lanes. A lane's reward is its own."""
+    world = from_task(task.load(name, vehicle))
+    own = type(world).step
 
-    plain, lighter = (kind(task.load("pendulum")) for kind in (PendulumEnv, Lighter))
-    states = jax.vmap(plain.reset, out_axes=-1)(jax.random.split(jax.random.PRNGKey(0), 3))
-    actions = jnp.array([[0.5, -1.0, 0.2]])
-    found, expected = lighter.step_lanes(states, actions), plain.step_lanes(states, actions / 2)
-    np.testing.assert_array_equal(found.obs, expected.obs)
+    def step(self: Any, state: Any, action: jax.Array) -> Any:
+        after = own(self, state, action / 2)
+        return after.replace(reward=after.reward - jnp.sum(action**2), done=jnp.float32(0.0))
+
+    if of == "class":
+        world = type("Costly", (type(world),), {"step": step})(world.task)
+    else:
+        world.step = types.MethodType(step, world)
+    states = jax.vmap(world.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    actions = jax.random.uniform(jax.random.PRNGKey(1), (3, world.action_size), minval=-1.0)
+    found = world.step_lanes(jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), states), actions.T)
+    for i in range(3):
+        alone = world.step(jax.tree.map(lambda x, i=i: x[i], states), actions[i])
+        np.testing.assert_allclose(found.reward[i], alone.reward, rtol=1e-5)
+        np.testing.assert_allclose(found.obs[:, i], alone.obs, rtol=1e-5, atol=1e-5)
 
 
 def test_parameters_and_a_flights_world_are_constant() -> None:
