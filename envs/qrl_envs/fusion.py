@@ -9,12 +9,14 @@ from typing import Any
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 
-# The barrier is what JAX does not simplify away.
+# With nothing in it JAX would drop the call.
 _same = jax.jit(jax.lax.optimization_barrier)
 
 
 def stored(x: Any) -> Any:
-    """`x`, any pytree of arrays, computed once on a CPU, and its cotangent too; elsewhere as the compiler likes."""
+    """`x`, any pytree of arrays, computed once where JAX's default backend is a CPU, and its cotangent too;
+    elsewhere as the compiler likes.
+    """
     if jax.default_backend() != "cpu":
         return x
     with set_xla_metadata(inlineable="false"):

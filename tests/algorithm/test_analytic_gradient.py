@@ -18,6 +18,7 @@ from bound_learner import BoundLearner
 from fault_injection import assert_same_leaves, leaves
 from qrl import tasks
 from qrl.algorithm import analytic_gradient
+from qrl.algorithm.carried import Carry
 from qrl.algorithm.learner import LearnerState
 from qrl.config import Config, load_preset, preset_names
 from qrl.runs import checkpoint, files
@@ -529,3 +530,21 @@ def test_the_first_updates_are_split_into_shorter_ones(tmp_path: Path, monkeypat
 def test_what_cannot_be_split_is_refused() -> None:
     with pytest.raises(ValidationError, match="expected apg_episode_length to be a multiple of apg_split = 3"):
         run_config(**WITH_APG, apg_split=3)
+
+
+@pytest.mark.parametrize("recurrent", [True, False])
+def test_the_bound_is_on_the_norm_of_all_that_a_flight_carries(recurrent: bool) -> None:
+    """NumPy's norm over observation, numbers and memory of each flight; those below it, and integers, as they are."""
+    rng, size = np.random.default_rng(0), np.array([[0.01], [0.1], [0.5], [10.0], [100.0], [np.inf]])
+    parts = [(size * rng.normal(size=(6, k))).astype(np.float32) for k in (5, 4, *([3] if recurrent else []))]
+    carry = Carry(jnp.zeros((6, 5)), jnp.zeros((4, 6)), jnp.zeros((0, 6)), [jnp.zeros(6, jnp.int32)])
+    memory = jnp.zeros((6, 3)) if recurrent else ()
+    _, back = jax.vjp(lambda *x: analytic_gradient._bounded(*x, jnp.float32(2.0)), carry, memory)
+    none = [np.zeros(6, jax.dtypes.float0)]
+    cotangent = Carry(jnp.asarray(parts[0]), jnp.asarray(parts[1].T), carry.drawn, none)
+    found, found_memory = back((cotangent, jnp.asarray(parts[2]) if recurrent else ()))
+    norm = np.sqrt(sum((x.astype(float) ** 2).sum(axis=1) for x in parts))
+    assert (norm < 2.0).sum() in (2, 3)
+    for ours, x in zip([found.observation, found.moving.T, *jax.tree.leaves(found_memory)], parts, strict=True):
+        np.testing.assert_allclose(ours[:5], (x * np.minimum(1.0, 2.0 / norm)[:, None])[:5], rtol=1e-4)
+        np.testing.assert_array_equal(ours[5], 0.0)

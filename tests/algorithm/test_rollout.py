@@ -258,6 +258,46 @@ def test_a_restart_keeps_the_lanes_own_parameters() -> None:
     np.testing.assert_array_equal(marked.steps.observation[..., GAIN], np.repeat(GAINS[:, None], UNROLLS * T, axis=1))
 
 
+class Redrawing(Fenced):
+    """A restart draws an integer that steps read; each step ends an episode by a mark of its own."""
+
+    def at(self, x: jax.Array) -> State:
+        info = {"truncated": jnp.float32(0.0), "late": jnp.float32(1.0), "drawn": jnp.int32(0)}
+        return super().at(x).replace(info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        late, drawn = state.info["late"], state.info["drawn"]
+        info = {"truncated": late, "late": 1.0 - late, "drawn": drawn}
+        return super().step(state, action).replace(reward=drawn.astype(float), done=jnp.float32(1.0), info=info)
+
+    def reset(self, rng: jax.Array) -> State:
+        state = super().reset(rng)
+        return state.replace(info=state.info | {"drawn": jax.random.randint(rng, (), 1, 1_000_000)})
+
+
+def test_an_integer_drawn_anew_and_a_mark_alone_are_carried() -> None:
+    """`done` has no lanes; a reward is what was drawn, and nothing but the mark depends on the leaf that sets it."""
+    env = Redrawing()
+    _, steps = unroll_of(env)(begin_of(env)(jax.random.key(0)), jax.random.key(1), jax.random.key(0))
+    rewards = np.asarray(steps.reward)
+    assert (rewards >= 1.0).all()
+    assert len(np.unique(rewards)) == rewards.size
+    np.testing.assert_array_equal(steps.truncated, 1.0)
+    np.testing.assert_array_equal(steps.terminated, 0.0)
+
+
+@pytest.mark.parametrize("change", ["type", "shape"])
+def test_a_step_that_changes_a_leafs_type_or_shape_is_refused(change: str) -> None:
+    class Changing(Fenced):
+        def step(self, state: State, action: jax.Array) -> State:
+            done = jnp.bool_(False) if change == "type" else jnp.zeros(2)
+            return super().step(state, action).replace(done=done)
+
+    lanes = begin_of(Fenced())(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"step gives another type or shape of \.done: expected float32 \[6\], found"):
+        rollout.Steps(adapt(Changing()), lanes)
+
+
 class Keeping(Fenced):
     """The same with leaves of its own: what a restart hands on and a step does not change, and what either changes."""
 

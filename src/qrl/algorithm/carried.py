@@ -52,7 +52,8 @@ class Carried:
         """Of step(states, actions) -> states, and of restart(state) -> state of one lane, if lanes restart.
 
         `results` are wanted of the states that a step gives, `wanted` of those that are unpacked, too; the observation
-        always is. `states` and `action` may be shapes. Raises ValueError for states of another structure.
+        always is. `states` and `action` may be shapes. Raises ValueError for states of another structure, or with
+        leaves of another type or shape.
         """
         leaves, self._structure = jax.tree.flatten(states)
         self._shapes = [x.shape[:-1] for x in leaves]
@@ -77,8 +78,15 @@ class Carried:
 
     def _traced(self, name: str, call: Callable[..., Any], *inputs: Any) -> Any:
         closed, after = jax.make_jaxpr(call, return_shape=True)(*inputs)
+        before = inputs[0]
         if (found := jax.tree.structure(after)) != self._structure:
             raise ValueError(f"{name} gives a state of another structure: expected {self._structure}, found {found}")
+        for (path, old), new in zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True):
+            # A constant needs no lanes.
+            if new.dtype != old.dtype or new.shape not in (old.shape, ()):
+                leaf = jax.tree_util.keystr(path)
+                expected, given = (f"{x.dtype} {list(x.shape)}" for x in (old, new))
+                raise ValueError(f"{name} gives another type or shape of {leaf}: expected {expected}, found {given}")
         return closed.jaxpr
 
     def pack(self, states: State) -> Carry:

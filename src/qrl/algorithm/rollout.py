@@ -33,7 +33,7 @@ class Lanes(NamedTuple):
     state: Any  # a State; where no later step depends on a leaf, it may be that of an earlier step
     steps: chex.Array  # [N] int32 into the episode
     done: chex.Array  # [N] bool: the episode is over; the lane restarts before its next step
-    next_state: Any  # a State [N]: each lane's next start
+    next_state: Any  # a State likewise: each lane's next start
     reset_count: chex.Array  # [N] int32: which of its starts that is
     next_state_used: chex.Array  # [N] bool
     num_early: chex.Array  # [N] int32: episodes so far that ended before their last step
@@ -41,9 +41,9 @@ class Lanes(NamedTuple):
 
 
 class UnrollCarry(NamedTuple):
-    """The lanes between two steps of an unroll; leading axis N everywhere."""
+    """The lanes between two steps of an unroll; leading axis N, but in what is carried of states."""
 
-    lanes: Lanes  # `state` and `next_state` as they are carried
+    lanes: Lanes  # `state` and `next_state` are a `Carry` each
     truncated: chex.Array  # [N] bool: the last step of this unroll ended an episode that is bootstrapped
     found: chex.Array  # [N] bool: an earlier one did
     final_observation: chex.Array  # [N, F] after the first that did
