@@ -259,16 +259,17 @@ def test_a_restart_keeps_the_lanes_own_parameters() -> None:
 
 
 class Redrawing(Fenced):
-    """A restart draws an integer that steps read; each step ends an episode by a mark of its own."""
+    """A restart draws an integer that steps read; the second step ends an episode, by a mark that the first sets."""
 
     def at(self, x: jax.Array) -> State:
-        info = {"truncated": jnp.float32(0.0), "late": jnp.float32(1.0), "drawn": jnp.int32(0)}
+        info = {"truncated": jnp.float32(0.0), "late": jnp.float32(0.0), "drawn": jnp.int32(0)}
         return super().at(x).replace(info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
         late, drawn = state.info["late"], state.info["drawn"]
-        info = {"truncated": late, "late": 1.0 - late, "drawn": drawn}
-        return super().step(state, action).replace(reward=drawn.astype(float), done=jnp.float32(1.0), info=info)
+        info = {"truncated": late, "late": jnp.float32(1.0), "drawn": drawn}
+        done = state.pipeline_state[CLOCK]
+        return super().step(state, action).replace(reward=drawn.astype(float), done=done, info=info)
 
     def reset(self, rng: jax.Array) -> State:
         state = super().reset(rng)
@@ -276,13 +277,13 @@ class Redrawing(Fenced):
 
 
 def test_an_integer_drawn_anew_and_a_mark_alone_are_carried() -> None:
-    """`done` has no lanes; a reward is what was drawn, and nothing but the mark depends on the leaf that sets it."""
+    """A reward is what was drawn; nothing but the mark depends on the leaf that sets it."""
     env = Redrawing()
     _, steps = unroll_of(env)(begin_of(env)(jax.random.key(0)), jax.random.key(1), jax.random.key(0))
     rewards = np.asarray(steps.reward)
-    assert (rewards >= 1.0).all()
-    assert len(np.unique(rewards)) == rewards.size
-    np.testing.assert_array_equal(steps.truncated, 1.0)
+    assert (rewards[:, 2:] >= 1.0).all()
+    assert len(np.unique(rewards)) == rewards.size // 2
+    np.testing.assert_array_equal(steps.truncated, np.tile([0.0, 1.0], (LANES, T // 2)))
     np.testing.assert_array_equal(steps.terminated, 0.0)
 
 
