@@ -151,7 +151,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         return self._with_truth(super().step(state, action))
 
     def step_lanes(self, state: State, action: chex.Array) -> State:
-        return super().step_lanes(state, action)  # `step` above is for many lanes, too
+        return super().step_lanes(state, action)  # so that `step` above is known to be for many lanes, too
 
     def _reset(self, params: Any, rng: chex.PRNGKey) -> State:
         return self._with_truth(super()._reset(params, rng))

@@ -42,9 +42,9 @@ def _bounded_backward(limit: chex.Array, cotangents: tuple[Carry, Any]) -> tuple
             return 0.0
         return jnp.sum(x * x, axis=[axis for axis in range(x.ndim) if axis != lanes % x.ndim])
 
-    whole = sum(square(x, 0) for x in jax.tree.leaves((carry.observation, memory)))
-    whole = whole + sum(square(x, -1) for x in jax.tree.leaves(carry[1:]))
-    factor = jnp.where(jnp.isfinite(whole), jnp.minimum(1.0, limit * jax.lax.rsqrt(whole + 1e-20)), 0.0)
+    total = sum(square(x, 0) for x in jax.tree.leaves((carry.observation, memory)))
+    total = total + sum(square(x, -1) for x in jax.tree.leaves(carry._replace(observation=())))
+    factor = jnp.where(jnp.isfinite(total), jnp.minimum(1.0, limit * jax.lax.rsqrt(total + 1e-20)), 0.0)
 
     def scaled(x: chex.Array, factor: chex.Array) -> chex.Array:
         return x if x.dtype == jax.dtypes.float0 else jnp.where(factor > 0.0, x * factor, 0.0)

@@ -28,8 +28,7 @@ class Carry(NamedTuple):
 
     def each(self, value: chex.Array) -> "Carry":
         """A value [n] for each lane, so that it broadcasts against every part."""
-        moving, drawn, others = jax.tree.map(lambda _: value, self[1:])
-        return Carry(value[:, None], moving, drawn, others)
+        return jax.tree.map(lambda _: value, self)._replace(observation=value[:, None])
 
 
 class Carried:

@@ -19,6 +19,7 @@ from qrl.algorithm.networks import log_density
 from qrl.algorithm.types import State, TaskEnv, Transition, info_flag
 from qrl_envs.fusion import stored
 
+TRUNCATIONS = "truncated", "truncation", "out_of_bounds"  # of an environment's `info`
 BLOCK_LANES = 512  # most lanes stepped at a time on a CPU: with more, what passes between steps leaves its cache
 
 
@@ -103,7 +104,7 @@ class Steps:
         return lanes._replace(state=state, next_state=next_state)
 
     def unpack(self, lanes: Lanes, before: Lanes) -> Lanes:
-        """Lanes with whole states; what is not carried of them is that of the lanes `before`."""
+        """Lanes with complete states; what is not carried of them is that of the lanes `before`."""
         state, next_state = (
             lanes_first(self._carried.unpack(carry, lanes_last(constant)))
             for carry, constant in ((lanes.state, before.state), (lanes.next_state, before.next_state))
@@ -122,7 +123,7 @@ class Steps:
             states = self._carried.unpack(lanes.state, constant)
             keys = _start_keys(key, lanes.lane_id, reset_count)
             starts = jax.vmap(self._env.restart, in_axes=(-1, 0), out_axes=-1)(states, keys)
-            # Stored, or XLA would lay starts out lane by lane, and turn them at every step.
+            # Stored, or XLA would lay starts out lane by lane, and transpose them at every step.
             next_state = stored(self._carried.pack(starts))
             unused = jnp.zeros_like(lanes.next_state_used)
             return lanes._replace(next_state=next_state, reset_count=reset_count, next_state_used=unused)
@@ -145,10 +146,7 @@ class Steps:
 
 def _results(state: State) -> Any:
     """What `_step` takes of the states that a step gives."""
-    return state.obs, state.reward, state.done, [state.info.get(name) for name in FLAGS]
-
-
-FLAGS = "truncated", "truncation", "out_of_bounds"  # of `info`
+    return state.obs, state.reward, state.done, [state.info.get(name) for name in TRUNCATIONS]
 
 
 def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any], values: Any, cheap: bool) -> Any:
@@ -193,7 +191,7 @@ def _step(
     # What an environment gives as a constant has no lanes.
     ended = jnp.broadcast_to(state.done.astype(bool), age.shape)
     out_of_bounds = ended & info_flag(state, "out_of_bounds")
-    truncated = ended & (info_flag(state, "truncated") | info_flag(state, "truncation")) | out_of_bounds
+    truncated = ended & functools.reduce(jnp.logical_or, [info_flag(state, name) for name in TRUNCATIONS])
     terminated = ended & ~truncated
     done = ended | (age >= max_episode_steps)
     transition = Transition(
