@@ -15,7 +15,8 @@ from experiments.output import table
 Run = dict[str, Any]
 CLOCKS = ("steps", "train_seconds", "compile_seconds", "total_seconds")
 BARS = {"pendulum": ("return_mean", -150.0), "hover": ("success", 0.99), "circle": ("success", 0.99)}
-ONE_DEVICE, TWO_DEVICES = ", one device", ", two devices"  # suffixes of a contestant's name, and so of its figures
+# Suffixes of a contestant's name, and so of its figures.
+ONE_CORE, EACH_CORE, TWO_DEVICES = ", one core", ", a process a core", ", two devices"
 REAL = "real plant, "  # prefix of a figure of a plant with lag, drag and sensors
 EASIER_PENDULUM = -160.0  # the threshold of published figures
 TUNED = (
@@ -136,8 +137,8 @@ def _of(lines: list[dict[str, float]], name: str) -> str:
 
 
 def figures(runs: list[Run]) -> dict[str, dict[str, dict[int, float]]]:
-    """Of the group `speed`: figure -> contestant -> value by seed. A number of devices in the
-    contestant's name ("qrl, one device") becomes part of the figure's name.
+    """Of the group `speed`: figure -> contestant -> value by seed. A number of devices or cores in the
+    contestant's name ("qrl, one core") becomes part of the figure's name.
     """
     found: dict[str, dict[str, dict[int, float]]] = {}
     for run in runs:
@@ -161,26 +162,23 @@ def speed(runs: list[Run]) -> str:
 
 
 def strip_device_suffix(figure: str) -> str:
-    """The figure's name without its number of devices."""
-    return figure.removesuffix(ONE_DEVICE).removesuffix(TWO_DEVICES)
+    """The figure's name without its number of devices or cores."""
+    return figure.removesuffix(ONE_CORE).removesuffix(EACH_CORE).removesuffix(TWO_DEVICES)
 
 
 def derived(runs: list[Run]) -> str:
-    """Ratios within a contestant: a given number of devices over its default, and the cost of acting by lanes."""
+    """Ratios within a contestant: of numbers of devices or cores, and the cost of acting by lanes."""
     found, rows = figures(runs), []
     for figure, values in found.items():
+        plain = strip_device_suffix(figure)
         for contestant, given in values.items():
-            by_itself = found.get(strip_device_suffix(figure), {}).get(contestant, {})
+            by_itself, one_core = (found.get(plain + how, {}).get(contestant, {}) for how in ("", ONE_CORE))
             if figure.endswith(TWO_DEVICES):
                 rows.append([f"{figure}, over its default", contestant, cell(ratios(given, by_itself), "×")])
-            elif figure.endswith(ONE_DEVICE):
-                rows.append(
-                    [
-                        f"{strip_device_suffix(figure)}, its default over one device",
-                        contestant,
-                        cell(ratios(by_itself, given), "×"),
-                    ]
-                )
+            elif figure.endswith(ONE_CORE):
+                rows.append([f"{plain}, its default over one core", contestant, cell(ratios(by_itself, given), "×")])
+            elif figure.endswith(EACH_CORE):
+                rows.append([f"{figure}, over one core", contestant, cell(ratios(given, one_core), "×")])
     for figure, values in found.items():
         if (ideal := found.get(figure.removeprefix(REAL), {}).get(QRL)) and figure.startswith(REAL):
             rows.append([f"{figure}, over the ideal plant", QRL, cell(ratios(values[QRL], ideal), "×")])

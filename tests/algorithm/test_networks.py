@@ -1,10 +1,11 @@
-"""The networks against the same formula in plain `jnp`, gradients too: their last layer has its own."""
+"""The networks against the same formula in plain `jnp`, gradients too: some layers have their own."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from qrl.algorithm import networks
 from qrl.algorithm.networks import MLP
 
 F = 5
@@ -52,3 +53,23 @@ def test_gradients_of_members_side_by_side(axes: tuple[int | None, int | None]) 
 
     ours, theirs = gradient(network.apply), gradient(plain)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3), ours, theirs)
+
+
+@pytest.mark.parametrize(("rows", "blocks"), [(12, 3), (18, 6), (13, 1), (4, 1)])
+def test_weight_gradients_in_blocks_of_rows(rows: int, blocks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a number of rows that blocks divide, one that none divides, and one that is a block by itself; each product
+    within the limit, as the compiled program has them.
+    """
+    monkeypatch.setattr(networks, "BLOCK_WORK", 4 * F * 8)
+    network = MLP((8,), 2, "tanh", final_gain=1.0, in_blocks=True)
+    x = jax.random.normal(jax.random.PRNGKey(0), (rows, F))
+    params = network.init(jax.random.PRNGKey(2), x)
+
+    def gradient(apply: object) -> object:
+        return jax.grad(lambda p, x: jnp.sum(jnp.sin(apply(p, x))), argnums=(0, 1))
+
+    ours, theirs = jax.jit(gradient(network.apply)).lower(params, x).compile(), gradient(plain)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5), ours(params, x), theirs(params, x)
+    )
+    assert (f"f32[{blocks},{F},8]" in ours.as_text()) == (blocks > 1)

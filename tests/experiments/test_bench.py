@@ -185,10 +185,12 @@ def test_rates_are_held_against_each_other() -> None:
 
     acting = {"acting_256": 4.0, "acting_1024": 5.0, "acting_4096": 4.5, "real plant_acting_256": 2.0}
     one = [rates("qrl", s, training=10.0 + s, **acting) for s in range(3)]
-    told = [rates("qrl, one device", s, training=5.0) for s in range(2)]
+    told = [rates("qrl, one core", s, training=5.0) for s in range(2)]
+    apart = [rates("qrl, a process a core", s, training=9.5) for s in range(2)]
     baseline = [rates("Brax", 0, training=2.0), rates("Brax, two devices", 0, training=4.0)]
-    text = derived([*one, *told, *baseline])
-    assert "| training, its default over one device | qrl | 2.1× [2 … 2.2] |" in text
+    text = derived([*one, *told, *apart, *baseline])
+    assert "| training, its default over one core | qrl | 2.1× [2 … 2.2] |" in text
+    assert "| training, a process a core, over one core | qrl | 1.9× [1.9 … 1.9] |" in text
     assert "| training, two devices, over its default | Brax | 2× [2 … 2] |" in text
     assert "| training, two devices | Brax | 4 [4 … 4] | 2.5× [2.5 … 2.5] |" in speed([*one, *told, *baseline])
     assert "| real plant, acting, 256, over the ideal plant | qrl | 0.5× [0.5 … 0.5] |" in text

@@ -40,12 +40,18 @@ class LearnerSpec(NamedTuple):
     @property
     def policy(self) -> Network:
         config = self.config
-        hidden, outputs = config.policy_hidden_layer_sizes, (self.action_size, config.activation, 0.01)
+        hidden = config.policy_hidden_layer_sizes
+        outputs = self.action_size, config.activation, 0.01, self._in_blocks
         return GRU(hidden, config.policy_gru_size, *outputs) if config.policy_gru_size else MLP(hidden, *outputs)
 
     @property
     def critic(self) -> MLP:
-        return MLP(self.config.critic_hidden_layer_sizes, 1, self.config.activation, final_gain=1.0)
+        return MLP(self.config.critic_hidden_layer_sizes, 1, self.config.activation, 1.0, self._in_blocks)
+
+    @property
+    def _in_blocks(self) -> bool:
+        """Whether a thread of this process runs a device: a product must not wait for the others'."""
+        return self.axis is not None and jax.default_backend() == "cpu"
 
 
 class LearnerState(NamedTuple):

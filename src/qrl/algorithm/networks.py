@@ -1,6 +1,7 @@
 """The Gaussian policy, feed-forward or recurrent, and the critic as flax modules; the log-density of the policy."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import chex
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 ACTIVATIONS: dict[str, Callable[[chex.Array], chex.Array]] = {"relu": nn.relu, "tanh": nn.tanh}
+BLOCK_WORK = 100 * 64**2  # multiply-adds up to which Eigen takes one thread for a product, whatever the machine has
 
 
 class MLP(nn.Module):
@@ -18,15 +20,13 @@ class MLP(nn.Module):
     outputs: int
     activation: str
     final_gain: float
+    in_blocks: bool = False  # weight gradients are sums over blocks of rows (`_gradient_in_blocks`)
 
     @nn.compact
     def __call__(self, x: chex.Array) -> chex.Array:
         for width in self.hidden:
-            x = ACTIVATIONS[self.activation](nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5))(x))
-        last = nn.Dense(
-            self.outputs, kernel_init=nn.initializers.orthogonal(self.final_gain), dot_general=_narrow_dot_general
-        )
-        return last(x)
+            x = ACTIVATIONS[self.activation](_hidden_layer(width, self.in_blocks)(x))
+        return _last_layer(self.outputs, self.final_gain)(x)
 
 
 class GRU(nn.Module):
@@ -40,15 +40,15 @@ class GRU(nn.Module):
     outputs: int
     activation: str
     final_gain: float
+    in_blocks: bool = False  # weight gradients are sums over blocks of rows (`_gradient_in_blocks`)
 
     def setup(self) -> None:
-        square, orthogonal = nn.initializers.orthogonal(), nn.initializers.orthogonal(2.0**0.5)
-        self.layers = [nn.Dense(width, kernel_init=orthogonal) for width in self.hidden]
+        square = nn.initializers.orthogonal()
+        self.layers = [_hidden_layer(width, self.in_blocks) for width in self.hidden]
         self.of_input = nn.Dense(3 * self.units, kernel_init=_each_gate(square), bias_init=_remembers)
         self.of_memory = nn.Dense(3 * self.units, kernel_init=_each_gate(square), use_bias=False)
         self.candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (self.units,))
-        final = nn.initializers.orthogonal(self.final_gain)
-        self.of_output = nn.Dense(self.outputs, kernel_init=final, dot_general=_narrow_dot_general)
+        self.of_output = _last_layer(self.outputs, self.final_gain)
 
     def __call__(self, memory: chex.Array, x: chex.Array) -> tuple[chex.Array, chex.Array]:
         """Next memory and output; [..., H], [..., F] -> [..., H], [..., outputs]."""
@@ -96,33 +96,76 @@ def _remembers(key: chex.PRNGKey, shape: tuple[int], dtype: Any = jnp.float32) -
     return jnp.zeros(shape, dtype).at[units : 2 * units].set(1.0)
 
 
-@jax.custom_vjp
-def _product(x: chex.Array, kernel: chex.Array) -> chex.Array:
-    """x @ kernel, [..., F] and [F, outputs], for few outputs; differentiable in reverse mode alone."""
+def _hidden_layer(width: int, in_blocks: bool) -> nn.Dense:
+    product = partial(_dot_general, _gradient_in_blocks) if in_blocks else jax.lax.dot_general
+    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5), dot_general=product)
+
+
+def _last_layer(outputs: int, gain: float) -> nn.Dense:
+    product = partial(_dot_general, _gradient_of_few_outputs)
+    return nn.Dense(outputs, kernel_init=nn.initializers.orthogonal(gain), dot_general=product)
+
+
+WeightGradient = Callable[[chex.Array, chex.Array], chex.Array]  # of x [n, F] and its product's error [n, outputs]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _product(weight_gradient: WeightGradient, x: chex.Array, kernel: chex.Array) -> chex.Array:
+    """x @ kernel, [..., F] and [F, outputs], whose kernel's gradient is computed by `weight_gradient`; differentiable
+    in reverse mode alone.
+    """
     return x @ kernel
 
 
-def _forward(x: chex.Array, kernel: chex.Array) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
-    return _product(x, kernel), (x, kernel)
+def _forward(
+    weight_gradient: WeightGradient, x: chex.Array, kernel: chex.Array
+) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
+    return _product(weight_gradient, x, kernel), (x, kernel)
 
 
-def _backward(residuals: tuple[chex.Array, chex.Array], error: chex.Array) -> tuple[chex.Array, chex.Array]:
+def _backward(
+    weight_gradient: WeightGradient, residuals: tuple[chex.Array, chex.Array], error: chex.Array
+) -> tuple[chex.Array, chex.Array]:
     x, kernel = residuals
-    # The barrier keeps XLA from folding the transposition into the product, which takes a CPU six times as long where
-    # outputs are few.
-    transposed = jax.lax.optimization_barrier(error.reshape(-1, error.shape[-1]).T @ x.reshape(-1, x.shape[-1]))
-    return error @ kernel.T, transposed.T
+    rows, errors = x.reshape(-1, x.shape[-1]), error.reshape(-1, error.shape[-1])
+    return error @ kernel.T, weight_gradient(rows, errors)
 
 
 _product.defvjp(_forward, _backward)
 
 
-def _narrow_dot_general(
-    x: chex.Array, kernel: chex.Array, dimension_numbers: Any, precision: Any = None, **_: Any
+def _gradient_of_few_outputs(x: chex.Array, error: chex.Array) -> chex.Array:
+    # The barrier keeps XLA from folding the transposition into the product, which takes a CPU six times as long where
+    # outputs are few.
+    return jax.lax.optimization_barrier(error.T @ x).T
+
+
+def _gradient_in_blocks(x: chex.Array, error: chex.Array) -> chex.Array:
+    """As a sum over blocks of rows, each of BLOCK_WORK or less where the number of rows allows it.
+
+    Eigen divides a larger product among the threads of the process. Where each has a device of its own to run, the
+    parts wait for each other: it then takes 1.4 times as long (docs/profile.md).
+    """
+    rows = x.shape[0]
+    least = -(-rows * x.shape[1] * error.shape[1] // BLOCK_WORK)
+    blocks = next((n for n in range(least, 2 * least) if rows % n == 0), 1)
+    if blocks == 1:
+        return x.T @ error
+    parts = jnp.einsum("bni,bno->bio", *(y.reshape(blocks, rows // blocks, -1) for y in (x, error)))
+    return jnp.sum(parts, axis=0)
+
+
+def _dot_general(
+    weight_gradient: WeightGradient,
+    x: chex.Array,
+    kernel: chex.Array,
+    dimension_numbers: Any,
+    precision: Any = None,
+    **_: Any,
 ) -> chex.Array:
     assert precision is None
     assert dimension_numbers == (((x.ndim - 1,), (0,)), ((), ()))
-    return _product(x, kernel)
+    return _product(weight_gradient, x, kernel)
 
 
 def log_density(action: chex.Array, mean: chex.Array, sigma: float | chex.Array) -> chex.Array:
