@@ -24,20 +24,29 @@ def rates(output: str) -> dict[str, float]:
     return {line["figure"]: line["per_second"] for line in lines}
 
 
+def summed(each: list[dict[str, float]]) -> dict[str, float]:
+    """The processes' figures, added up."""
+    return {figure: sum(one[figure] for one in each) for figure in each[0]}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--processes", type=int)
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     words = [sys.executable, str(SCRIPT), "--only", "training", "--seed", str(args.seed)]
+    if not hasattr(os, "sched_setaffinity"):
+        sys.exit("expected Linux: here no process can be pinned to a core")
     cores = sorted(os.sched_getaffinity(0))[: args.processes]
     processes = [
         subprocess.Popen(words, stdout=subprocess.PIPE, text=True, preexec_fn=partial(os.sched_setaffinity, 0, {core}))
         for core in cores
     ]
     each = [rates(process.communicate()[0]) for process in processes]
-    for figure in each[0]:
-        report({"figure": figure, "per_second": sum(one[figure] for one in each)})
+    if any(process.returncode for process in processes):
+        sys.exit("a process failed: its message is above")
+    for figure, per_second in summed(each).items():
+        report({"figure": figure, "per_second": per_second})
 
 
 if __name__ == "__main__":

@@ -150,7 +150,8 @@ def run_fingerprint(contestant: Contestant) -> dict[str, Any]:
     here = {name: value for name, value in machine().items() if name != "commit"}
     if contestant.environment is None:
         presets = json.dumps([load_preset(name) for name in preset_names()])
-        scripts = [BASELINES / contestant.script, ROOT / "src" / "qrl" / "training" / "devices.py"]
+        rates = ROOT / "experiments" / "profiling" / "throughput.py"  # what other scripts run
+        scripts = [BASELINES / contestant.script, rates, ROOT / "src" / "qrl" / "training" / "devices.py"]
         parts = [figure_runs.sha256(), presets, f"{contestant.devices}", *(path.read_text() for path in scripts)]
         return here | {"code": hashlib.sha256(json.dumps(parts).encode()).hexdigest()}
     return here | {"requirements": fingerprint(BASELINES / f"{contestant.environment}.txt")}

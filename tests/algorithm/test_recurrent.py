@@ -52,6 +52,32 @@ def test_the_cell_is_flaxs() -> None:
     np.testing.assert_allclose(output, expected @ own["of_output"]["kernel"] + own["of_output"]["bias"], atol=1e-5)
 
 
+def test_weight_gradients_of_a_trajectory_in_blocks_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the layers before the gates and of the gates' own, as where several devices share a process."""
+    monkeypatch.setattr(networks, "BLOCK_WORK", 10 * 5 * 18)
+    monkeypatch.setattr(networks, "MIN_BLOCK_ROWS", 10)
+    spec = LearnerSpec(config(policy_hidden_layer_sizes=(5,), policy_gru_size=6), INPUTS, 2)
+    plain, in_blocks = spec.policy, spec._replace(axis="shard").policy
+    assert (plain.in_blocks, in_blocks.in_blocks) == (False, True)
+    keys = jax.random.split(jax.random.PRNGKey(5), 2)
+    x, first = jax.random.normal(keys[0], (LANES, T, INPUTS)), jax.random.normal(keys[1], (LANES, 6))
+
+    def gradient(network: GRU) -> Any:
+        def loss(params: Any) -> jax.Array:
+            return jnp.sum(jnp.sin(networks.unroll(network, params, first, x, jnp.zeros((LANES, T)))))
+
+        return jax.jit(jax.grad(loss)).lower(parameters()).compile()
+
+    compiled = gradient(in_blocks)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5),
+        compiled(parameters()),
+        gradient(plain)(parameters()),
+    )
+    assert "f32[2,3,5]" in compiled.as_text()  # 100 rows of 3 and 5
+    assert "f32[10,5,18]" in compiled.as_text()  # and of 5 and 18
+
+
 def test_a_trajectory_is_its_steps_one_by_one() -> None:
     """Memory starts anew after each end, the first step begins with the memory given, and so do the gradients."""
     params, keys = parameters(), jax.random.split(jax.random.PRNGKey(5), 3)

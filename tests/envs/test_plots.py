@@ -12,7 +12,7 @@ from qrl.runs import learning_curve
 from qrl_envs import task
 from qrl_envs.plots import errors as errors_of
 from qrl_envs.plots import flights as flights_of
-from qrl_envs.plots import settle
+from qrl_envs.plots import frame, settle
 
 Array = np.ndarray
 Row = dict[str, float | str]
@@ -323,3 +323,13 @@ def test_the_speed_of_a_clockwise_circle_is_shown_the_right_way_up() -> None:
         mirrored = approach("circle") * np.where(np.isin(np.arange(18), (10, 13)), np.sign(speed), 1.0)
         low, high = flights_of.figure(spec, mirrored).axes[2].get_ylim()
         assert min(-speed, 3 * speed) <= low < speed < high <= max(-speed, 3 * speed)
+
+
+@pytest.mark.parametrize(("comes_to", "lowest"), [(0.003, 0.001), (1e-9, 2e-5), (0.1, 0.002), (np.nan, 0.002)], ids=str)
+def test_a_logarithmic_axis_reaches_down_to_what_the_lines_come_to(comes_to: float, lowest: float) -> None:
+    """A third of it, within 1e-4 to 1e-2 of the tolerance, here 0.2 m; not of how they begin."""
+    values = np.full((3, SAMPLES), comes_to)
+    values[:, :20] = 5.0
+    low, high = frame.logarithmic("distance", "m", values, tolerance=0.2).limits
+    assert low == pytest.approx(lowest)
+    assert high == pytest.approx(6.0)

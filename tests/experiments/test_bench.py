@@ -16,6 +16,7 @@ from brax import envs
 import brax_ppo
 import judge
 import qrl_command
+import qrl_cores
 from experiments.bench import run as bench
 from experiments.bench.contestants import CONTESTANTS, Contestant, chosen
 from experiments.bench.install import fingerprint, python_of
@@ -196,6 +197,12 @@ def test_rates_are_held_against_each_other() -> None:
     assert "| real plant, acting, 256, over the ideal plant | qrl | 0.5× [0.5 … 0.5] |" in text
     assert "highest cost over its lowest, of 3 numbers of lanes | qrl | 1.25× [1.25 … 1.25] |" in text
     assert derived([]) == ""
+
+
+def test_rates_of_processes_are_added_up() -> None:
+    output = 'compiling\nBENCH {"figure": "training", "per_second": 2.5, "elapsed": 1}\n'
+    found = qrl_cores.rates(output)
+    assert qrl_cores.summed([found, {"training": 4.0}]) == {"training": 6.5}
 
 
 def test_a_command_tells_the_worst_of_its_checkpoints() -> None:

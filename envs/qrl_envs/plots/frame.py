@@ -17,7 +17,7 @@ from qrl_envs.task import Task
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")  # Okabe and Ito: safe for color-blind readers
 INK, SHADE, GOOD = "#333333", "#EEEEEE", "#009E73"
 PIXELS_PER_INCH = 150
-MIN, MAX = 0.01, 200.0  # limits of a logarithmic axis, in tolerances
+LEAST, MIN, MAX = 1e-4, 0.01, 200.0  # limits of a logarithmic axis, in tolerances; LEAST to MIN are of its lower end
 ERRORS = {  # name in measures.py -> label; unit; name of its tolerance in the task's `evaluation`
     "position_m": ("distance to target", "m", "distance_m"),
     "radius_m": ("radius error", "m", "distance_m"),
@@ -90,9 +90,14 @@ class Panel(NamedTuple):
 
 
 def logarithmic(label: str, unit: str, values: np.ndarray, tolerance: float) -> Panel:
-    """A panel of values ≥ 0, clipped to the axis; NaN is not drawn."""
-    largest = np.max(values, initial=0.0, where=np.isfinite(values))
-    limits = MIN * tolerance, 1.2 * tolerance * min(max(largest / tolerance, 10.0), MAX)
+    """A panel of values ≥ 0 [lines, K + 1], clipped to the axis, which shows what they come to in the second half; NaN
+    is not drawn.
+    """
+    finite = np.isfinite(values)
+    largest = np.max(values, initial=0.0, where=finite)
+    late = values[:, values.shape[1] // 2 :][finite[:, values.shape[1] // 2 :]]
+    low = np.clip(np.median(late) / 3.0 / tolerance, LEAST, MIN) if late.size else MIN
+    limits = tolerance * low, 1.2 * tolerance * min(max(largest / tolerance, 10.0), MAX)
     return Panel(label, unit, np.clip(values, *limits), limits, 0.0, tolerance, "log")
 
 

@@ -50,7 +50,7 @@ class LearnerSpec(NamedTuple):
 
     @property
     def _in_blocks(self) -> bool:
-        """Whether a thread of this process runs a device: a product must not wait for the others'."""
+        """Whether several devices are threads of this process, where Eigen's parts of a product wait for each other."""
         return self.axis is not None and jax.default_backend() == "cpu"
 
 

@@ -10,7 +10,8 @@ import jax
 import jax.numpy as jnp
 
 ACTIVATIONS: dict[str, Callable[[chex.Array], chex.Array]] = {"relu": nn.relu, "tanh": nn.tanh}
-BLOCK_WORK = 100 * 64**2  # multiply-adds up to which Eigen takes one thread for a product, whatever the machine has
+BLOCK_WORK = 100 * 64**2  # multiply-adds; twice as many were still computed by one thread, four times by two
+MIN_BLOCK_ROWS = 32  # thinner blocks take longer than one product, of wide layers many times as long
 
 
 class MLP(nn.Module):
@@ -45,7 +46,10 @@ class GRU(nn.Module):
     def setup(self) -> None:
         square = nn.initializers.orthogonal()
         self.layers = [_hidden_layer(width, self.in_blocks) for width in self.hidden]
-        self.of_input = nn.Dense(3 * self.units, kernel_init=_each_gate(square), bias_init=_remembers)
+        product = _hidden_product(self.in_blocks)
+        self.of_input = nn.Dense(
+            3 * self.units, kernel_init=_each_gate(square), bias_init=_remembers, dot_general=product
+        )
         self.of_memory = nn.Dense(3 * self.units, kernel_init=_each_gate(square), use_bias=False)
         self.candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (self.units,))
         self.of_output = _last_layer(self.outputs, self.final_gain)
@@ -96,9 +100,13 @@ def _remembers(key: chex.PRNGKey, shape: tuple[int], dtype: Any = jnp.float32) -
     return jnp.zeros(shape, dtype).at[units : 2 * units].set(1.0)
 
 
+def _hidden_product(in_blocks: bool) -> Any:
+    return partial(_dot_general, _gradient_in_blocks) if in_blocks else jax.lax.dot_general
+
+
 def _hidden_layer(width: int, in_blocks: bool) -> nn.Dense:
-    product = partial(_dot_general, _gradient_in_blocks) if in_blocks else jax.lax.dot_general
-    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5), dot_general=product)
+    orthogonal = nn.initializers.orthogonal(2.0**0.5)
+    return nn.Dense(width, kernel_init=orthogonal, dot_general=_hidden_product(in_blocks))
 
 
 def _last_layer(outputs: int, gain: float) -> nn.Dense:
@@ -141,14 +149,16 @@ def _gradient_of_few_outputs(x: chex.Array, error: chex.Array) -> chex.Array:
 
 
 def _gradient_in_blocks(x: chex.Array, error: chex.Array) -> chex.Array:
-    """As a sum over blocks of rows, each of BLOCK_WORK or less where the number of rows allows it.
+    """As a sum over blocks of rows, each of BLOCK_WORK or less, where the number of rows allows it and each has at
+    least MIN_BLOCK_ROWS: of layers of up to 100 units or so.
 
     Eigen divides a larger product among the threads of the process. Where each has a device of its own to run, the
-    parts wait for each other: it then takes 1.4 times as long (docs/profile.md).
+    parts wait for each other (docs/profile.md, "With two devices").
     """
     rows = x.shape[0]
     least = -(-rows * x.shape[1] * error.shape[1] // BLOCK_WORK)
-    blocks = next((n for n in range(least, 2 * least) if rows % n == 0), 1)
+    most = min(2 * least - 1, rows // MIN_BLOCK_ROWS)
+    blocks = next((n for n in range(least, most + 1) if rows % n == 0), 1)
     if blocks == 1:
         return x.T @ error
     parts = jnp.einsum("bni,bno->bio", *(y.reshape(blocks, rows // blocks, -1) for y in (x, error)))
