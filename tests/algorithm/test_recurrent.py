@@ -53,8 +53,8 @@ def test_the_cell_is_flaxs() -> None:
 
 
 def test_weight_gradients_of_a_trajectory_in_blocks_of_rows(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the layers before the gates and of the gates' own, as where several devices share a process."""
-    monkeypatch.setattr(networks, "BLOCK_WORK", 10 * 5 * 18)
+    """Of the layers before the gates, as where several devices share a process."""
+    monkeypatch.setattr(networks, "BLOCK_WORK", 50 * 3 * 5)
     monkeypatch.setattr(networks, "MIN_BLOCK_ROWS", 10)
     spec = LearnerSpec(config(policy_hidden_layer_sizes=(5,), policy_gru_size=6), INPUTS, 2)
     plain, in_blocks = spec.policy, spec._replace(axis="shard").policy
@@ -75,7 +75,6 @@ def test_weight_gradients_of_a_trajectory_in_blocks_of_rows(monkeypatch: pytest.
         gradient(plain)(parameters()),
     )
     assert "f32[2,3,5]" in compiled.as_text()  # 100 rows of 3 and 5
-    assert "f32[10,5,18]" in compiled.as_text()  # and of 5 and 18
 
 
 def test_a_trajectory_is_its_steps_one_by_one() -> None:

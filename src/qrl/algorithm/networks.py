@@ -21,7 +21,7 @@ class MLP(nn.Module):
     outputs: int
     activation: str
     final_gain: float
-    in_blocks: bool = False  # weight gradients are sums over blocks of rows (`_gradient_in_blocks`)
+    in_blocks: bool = False  # hidden layers' weight gradients are sums over blocks of rows (`_gradient_in_blocks`)
 
     @nn.compact
     def __call__(self, x: chex.Array) -> chex.Array:
@@ -41,15 +41,12 @@ class GRU(nn.Module):
     outputs: int
     activation: str
     final_gain: float
-    in_blocks: bool = False  # weight gradients are sums over blocks of rows (`_gradient_in_blocks`)
+    in_blocks: bool = False  # hidden layers' weight gradients are sums over blocks of rows (`_gradient_in_blocks`)
 
     def setup(self) -> None:
         square = nn.initializers.orthogonal()
         self.layers = [_hidden_layer(width, self.in_blocks) for width in self.hidden]
-        product = _hidden_product(self.in_blocks)
-        self.of_input = nn.Dense(
-            3 * self.units, kernel_init=_each_gate(square), bias_init=_remembers, dot_general=product
-        )
+        self.of_input = nn.Dense(3 * self.units, kernel_init=_each_gate(square), bias_init=_remembers)
         self.of_memory = nn.Dense(3 * self.units, kernel_init=_each_gate(square), use_bias=False)
         self.candidate_bias = self.param("candidate_bias", nn.initializers.zeros, (self.units,))
         self.of_output = _last_layer(self.outputs, self.final_gain)
@@ -100,13 +97,9 @@ def _remembers(key: chex.PRNGKey, shape: tuple[int], dtype: Any = jnp.float32) -
     return jnp.zeros(shape, dtype).at[units : 2 * units].set(1.0)
 
 
-def _hidden_product(in_blocks: bool) -> Any:
-    return partial(_dot_general, _gradient_in_blocks) if in_blocks else jax.lax.dot_general
-
-
 def _hidden_layer(width: int, in_blocks: bool) -> nn.Dense:
-    orthogonal = nn.initializers.orthogonal(2.0**0.5)
-    return nn.Dense(width, kernel_init=orthogonal, dot_general=_hidden_product(in_blocks))
+    product = partial(_dot_general, _gradient_in_blocks) if in_blocks else jax.lax.dot_general
+    return nn.Dense(width, kernel_init=nn.initializers.orthogonal(2.0**0.5), dot_general=product)
 
 
 def _last_layer(outputs: int, gain: float) -> nn.Dense:
