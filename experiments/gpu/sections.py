@@ -202,11 +202,12 @@ def train(sizes: Sizes, task: str, count: int) -> None:
     config = trainer.config
     states = jax.block_until_ready(trainer.init(driver.seeds(FIRST_SEED, count), inputs))
     # Not what they record: gigabytes, of many seeds.
-    flown = lambda *args: trainer.fly.__wrapped__(*args)._replace(observations=(), actions=())  # noqa: E731
+    flights = driver.report_flights(trainer).__wrapped__
+    flown = lambda *args: flights(*args)._replace(observations=(), actions=())  # noqa: E731
     fly = jax.jit(flown, compiler_options=trainer.effort("fly"))
     with ThreadPoolExecutor() as pool:
         apg = pool.submit(driver.compile_apg, trainer, states, inputs)
-        reports = pool.submit(fly.lower(states.learner, inputs, driver.report_starts(config)).compile)
+        reports = pool.submit(fly.lower(states.learner, inputs).compile)
         programs = driver.Programs(
             pool.submit(driver.compile_train, trainer, states, inputs).result,
             apg.result,

@@ -49,7 +49,7 @@ def main(folder: Path) -> None:
         points = stack([member_inputs(env, config)] * seeds)
         trainer = make_trainer(env, config, make_mesh(jax.devices()[:count], seeds, config.shard_count))
         states = trainer.train(trainer.init(driver.seeds(5, seeds), points), points, np.int32(TEN_UPDATES))
-        flights = trainer.fly(states.learner, points, driver.report_starts(config))
+        flights = driver.report_flights(trainer)(states.learner, points)
         np.savez(folder / f"{seeds}-{count}.npz", **named(trainer.gather((states, flights))))
         if seeds == 1:
             saved = saved or next(trainer.members(states))  # from one device, as a checkpoint has it

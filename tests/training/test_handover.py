@@ -67,7 +67,7 @@ def start(walls: list[float], trainer: Trainer | None = None) -> tuple[TrainStat
     shared, trainer = trainer is None, trainer or small_run.trainer_of(ENV, CONFIG)
     inputs = stack([MemberInputs(CONFIG.hyperparameters, np.float32(wall)) for wall in walls])
     states = trainer.init(driver.seeds(0, len(walls)), inputs)
-    train, apg, fly = trainer.train, trainer.apg, trainer.fly
+    train, apg, fly = trainer.train, trainer.apg, driver.report_flights(trainer)
     if shared:
         abstract = restore.abstract_states(trainer, inputs)
         train, apg, fly = (small_run.lower_once(trainer, name, abstract, inputs)() for name in ("train", "apg", "fly"))

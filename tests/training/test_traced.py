@@ -73,7 +73,7 @@ def test_what_was_damaged_is_traced_again(tmp_path: Path, damage: str) -> None:
     path.write_bytes(damaged[damage])
     program = traced.trace(store, "double", double, args)
     assert program is not None
-    assert program.compile(args, {})(jax.numpy.full(3, 4.0))["twice"].tolist() == [8.0] * 3
+    assert program.lower(args, {})()(jax.numpy.full(3, 4.0))["twice"].tolist() == [8.0] * 3
     assert len(calls) == 2
     assert path.read_bytes()[32:] != damaged[damage][32:]
     traced.trace(store, "double", double, args)
@@ -146,7 +146,7 @@ def test_a_full_disk_costs_a_run_nothing(tmp_path: Path) -> None:
     store, args = Store(tmp_path / "file" / "store", "these settings"), (jax.numpy.ones(3),)
     program = traced.trace(store, "double", lambda x: 2.0 * x, args)
     assert program is not None
-    assert program.compile(args, {}, donated=0)(jax.numpy.full(3, 4.0)).tolist() == [8.0] * 3
+    assert program.lower(args, {}, donated=0)()(jax.numpy.full(3, 4.0)).tolist() == [8.0] * 3
 
 
 def test_what_cannot_be_kept_is_left_to_jax(tmp_path: Path) -> None:

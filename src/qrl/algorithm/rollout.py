@@ -150,13 +150,14 @@ def _results(state: State) -> Any:
 
 
 def _at_most_once(needed: Callable[[Any], chex.Array], act: Callable[[Any], Any], values: Any, cheap: bool) -> Any:
-    """act(values) where `needed`(values), which is false of the result, else the values themselves.
+    """act(values) where `needed`(values), else the values themselves.
 
     On a CPU a loop, which takes its values in place where the branches of a condition copy them. A GPU reads a
     predicate back to the host: there what is `cheap`, and changes nothing where it is not needed, is done each time.
     """
     if jax.default_backend() == "cpu":
-        return jax.lax.while_loop(needed, act, values)
+        first = needed(values), values
+        return jax.lax.while_loop(lambda now: now[0], lambda now: (jnp.zeros_like(now[0]), act(now[1])), first)[1]
     return act(values) if cheap else jax.lax.cond(needed(values), act, lambda now: now, values)
 
 
@@ -230,8 +231,9 @@ def unroll(
 
     count = lanes.lane_id.shape[0]
     num_blocks = _num_blocks(count)
-    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, count // num_blocks, *x.shape[1:]), lanes)
-    first = jax.tree.map(lambda x: x[0], blocks)
+    size = count // num_blocks
+    blocks = jax.tree.map(lambda x: x.reshape(num_blocks, size, *x.shape[1:]), lanes)
+    first = jax.tree.map(lambda x: x[0], blocks) if num_blocks > 1 else lanes
     steps = Steps(env, first)
     # Jitted, so that it is traced once for its shapes and for the loop.
     step = jax.jit(functools.partial(_step, steps, policy, sigma, start_key, max_episode_steps), inline=True)
@@ -261,13 +263,38 @@ def unroll(
         after = steps.unpack(last.lanes, lanes)
         return record, (after, jnp.stack([last.final_observation, final], axis=1), memory)
 
-    noise = jnp.zeros((count // num_blocks, env.action_size))
-    of_step = jax.eval_shape(step, *begin(first), noise)[1]
-    lead = num_blocks, count // num_blocks, unroll_length
-    record = jax.tree.map(lambda x: jnp.zeros((*lead, *x.shape[1:]), x.dtype), of_step)
-    record, after = jax.lax.scan(unroll_block, record, (jnp.arange(num_blocks), blocks))
-    record, (lanes, final, memory) = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), (record, after))
+    of_step = jax.eval_shape(step, *begin(first), jnp.zeros((size, env.action_size)))[1]
+    record = jax.tree.map(lambda x: jnp.zeros((num_blocks, size, unroll_length, *x.shape[1:]), x.dtype), of_step)
+    if num_blocks == 1:  # a loop that is passed once still takes its time to compile
+        record, after = unroll_block(record, (jnp.int32(0), lanes))
+    else:
+        record, after = jax.lax.scan(unroll_block, record, (jnp.arange(num_blocks), blocks))
+        after = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), after)
+    record = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), record)
+    lanes, final, memory = after
     return lanes, record._replace(final_observation=final, memory=memory)
+
+
+def transitions_of(lanes: Lanes, action_size: int, unroll_length: int) -> Transition:
+    """Shapes and types of what `unroll` records of lanes like these, without tracing a step."""
+    state, count = lanes.state, lanes.done.shape[0]
+
+    def each(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((count, *shape), dtype)
+
+    features, seen = state.obs.shape[-1], state.obs.dtype
+    flag = each(unroll_length)
+    return Transition(
+        observation=each(unroll_length, features, dtype=seen),
+        action=each(unroll_length, action_size),
+        log_mu=each(unroll_length),
+        reward=each(unroll_length, dtype=state.reward.dtype),
+        terminated=flag,
+        truncated=flag,
+        out_of_bounds=flag,
+        final_observation=each(2, features, dtype=seen),
+        memory=jax.tree.map(lambda x: each(*x.shape[1:], dtype=x.dtype), lanes.memory),
+    )
 
 
 def _num_blocks(count: int) -> int:

@@ -7,8 +7,8 @@ import os
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from itertools import accumulate
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from qrl.config import FORMER_NAMES
 from qrl_envs.specfile import BadInput, read
 
 CACHE_BYTES = 2_000_000_000  # of compiled programs
+RARE_COLLECTIONS = 200_000, 20, 20  # objects made between two collections of garbage, and how many of each kind a next
 
 
 def configure_jax() -> None:
@@ -33,18 +34,6 @@ def configure_jax() -> None:
         jax.config.update("jax_compilation_cache_dir", str(cache))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-
-
-@contextmanager
-def without_collections() -> Iterator[None]:
-    """No garbage collection within: imports make much, drop little, and are gone through each time."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
 
 
 def limit_size(folder: Path, most_bytes: int) -> None:
@@ -64,14 +53,15 @@ def limit_size(folder: Path, most_bytes: int) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 failed while running, 2 the input was wrong."""
     keep_interrupts()
+    # Imports and tracing make much and drop little, and Python would go through all of it again and again.
+    gc.set_threshold(*RARE_COLLECTIONS)
     args = parse(argv)
     subject = {"train": "task", "sweep": "grid", "identify": "vehicle"}.get(args.command, "run")
     if args.command != "tasks":
         print(f"qrl {args.command} {getattr(args, subject) or args.config or ''}: loading JAX", flush=True)
     _note_former_names(getattr(args, "config", None) or getattr(args, "grid", None))
     try:
-        with without_collections():
-            configure_jax()
+        configure_jax()
     except KeyboardInterrupt:
         print_error("interrupted")
         return FAILED
@@ -92,14 +82,13 @@ def _note_former_names(path: Path | None) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     """Run the parsed command and map what goes wrong to one line and an exit code."""
-    with without_collections():
-        import jax
+    import jax
 
-        from qrl.export.kernel import AccumulatorOverflow
-        from qrl.export.targets import VerificationFailed
-        from qrl.runs import shipped
-        from qrl.runs.integrity import IncompatibleCheckpoint
-        from qrl.training.driver import NotFinite
+    from qrl.export.kernel import AccumulatorOverflow
+    from qrl.export.targets import VerificationFailed
+    from qrl.runs import shipped
+    from qrl.runs.integrity import IncompatibleCheckpoint
+    from qrl.training.driver import NotFinite
 
     code = FAILED
     try:
@@ -137,8 +126,7 @@ def _command(name: str) -> Callable[[argparse.Namespace], int]:
     """The command of that name, imported lazily: none waits for what another needs."""
     if name == "tasks":
         return _list_tasks
-    with without_collections():
-        command = getattr(importlib.import_module(f"qrl.cli.{name}"), name)
+    command = getattr(importlib.import_module(f"qrl.cli.{name}"), name)
     if not gc.get_freeze_count():  # once in a process: what was imported stays, and need not be gone through again
         gc.freeze()
     return command

@@ -107,9 +107,6 @@ class Writer:
     """
 
     def __init__(self, folder: Path, run: RunConfig, thread: ThreadPoolExecutor) -> None:
-        from qrl.runs import orbax_files
-
-        self._files = orbax_files
         self._folder = folder
         self._descriptor = os.open(folder, os.O_RDONLY)  # while it is open, no new folder can get the same inode
         self._run_sha256 = run.sha256
@@ -153,6 +150,8 @@ class Writer:
         raise OSError(f"{self._folder}: the run folder is gone")
 
     def _save(self, checkpoint: Checkpoint) -> None:
+        from qrl.runs import orbax_files  # in this thread, beside training; before it, what compiles needs both cores
+
         begun = time.perf_counter()
         path = _root(self._folder) / str(checkpoint.env_steps)
         state = _by_name(checkpoint.state)
@@ -162,7 +161,7 @@ class Writer:
             # Orbax prints tracebacks when the disk fills up during a save.
             if shutil.disk_usage(path.parent).free < sum(leaf.nbytes for leaf in state.values()) * 5 // 4 + 2**20:
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            self._files.save(path.parent, checkpoint.env_steps, state, record, KEEP, [best])
+            orbax_files.save(path.parent, checkpoint.env_steps, state, record, KEEP, [best])
             self._check_folder()  # if it was removed meanwhile, Orbax has created it again
             integrity.write_manifest(path)
             self.seconds = time.perf_counter() - begun

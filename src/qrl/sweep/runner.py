@@ -127,7 +127,7 @@ def member_bytes(trainer: Trainer, inputs: MemberInputs) -> int:
     """Bytes of device memory of a member: its state twice (input and output of the program), and its flights."""
     one = stack([inputs])
     states = jax.eval_shape(trainer.init, driver.seeds(0, 1), one)
-    flights = jax.eval_shape(trainer.fly, states.learner, one, driver.report_starts(trainer.config))
+    flights = jax.eval_shape(driver.report_flights(trainer), states.learner, one)
     return 2 * _bytes(states) + _bytes(flights)
 
 

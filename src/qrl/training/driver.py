@@ -57,7 +57,7 @@ class Programs:
 
     train: Callable[[], Program]
     apg: Callable[[], Program]
-    fly: Callable[[], Callable[[LearnerState, MemberInputs, jax.Array], Flights]]
+    fly: Callable[[], Callable[[LearnerState, MemberInputs], Flights]]
     gather: Callable[[Any], Any]
 
 
@@ -72,7 +72,7 @@ def compile_init(trainer: Trainer, count: int, inputs: MemberInputs, store: Stor
 
     def init(*given: Any) -> TrainState:
         program = found or (traced.trace(store, "init", traced_once, args) if store else None)
-        return program.compile(args, trainer.effort("init"))(*given) if program else trainer.init(*given)
+        return program.lower(args, trainer.effort("init"))()(*given) if program else trainer.init(*given)
 
     return shapes, init
 
@@ -87,14 +87,12 @@ def lower(
     config = trainer.config
     if (name == "train" and config.all_apg) or (name == "apg" and not config.num_apg_updates):
         return lambda: None
-    args = states, inputs, np.int32(0)
-    if name == "fly":
-        args = states.learner, inputs, report_starts(config)
-    jitted = getattr(trainer, name)
+    args = (states.learner, inputs) if name == "fly" else (states, inputs, np.int32(0))
+    jitted = report_flights(trainer) if name == "fly" else getattr(trainer, name)
     program = traced.trace(store, name, jitted.__wrapped__, args) if store else None
     if program is None:
         return jitted.lower(*args).compile
-    return lambda: program.compile(args, trainer.effort(name), DONATED.get(name))
+    return program.lower(args, trainer.effort(name), DONATED.get(name))
 
 
 def compile_train(trainer: Trainer, states: TrainState, inputs: MemberInputs, store: Store | None = None) -> Any:
@@ -118,6 +116,18 @@ def report_starts(config: Config) -> jax.Array:
     return jax.random.split(jax.random.PRNGKey(REPORT_STARTS_SEED), config.num_eval_envs)
 
 
+def report_flights(trainer: Trainer) -> Any:
+    """A jitted program: (learners [M], inputs [M]) -> the flights [M] of a report.
+
+    It draws the starts itself: a program of their own, compiled beside larger ones, would wait for their threads.
+    """
+
+    def fly(learners: LearnerState, inputs: MemberInputs) -> Flights:
+        return trainer.fly.__wrapped__(learners, inputs, report_starts(trainer.config))
+
+    return jax.jit(fly, compiler_options=trainer.effort("fly"))
+
+
 def run_chunks(
     states: TrainState,
     inputs: MemberInputs,
@@ -132,7 +142,7 @@ def run_chunks(
     Processes that share the members must make the same chunks: `all_gather` gives a value of each process.
     """
     done = first = int(programs.gather(states.unrolls)[0])
-    count, starts = len(states.unrolls), report_starts(config)
+    count = len(states.unrolls)
     start_time = time.perf_counter()
     size = 1
     while done < config.num_unrolls and not all_gather(stopped()).any():
@@ -158,7 +168,7 @@ def run_chunks(
         extended: dict[int, int] = {}
         handing_over = (handover == done) & (done < config.num_unrolls)
         if done == report_at or handing_over.any():
-            flights: Flights = programs.gather(programs.fly()(states.learner, inputs, starts))
+            flights: Flights = programs.gather(programs.fly()(states.learner, inputs))
             flies = flights.complete.mean(axis=1) >= HANDOVER_SHARE
             # A bounded gradient learns from flights that go wrong, too.
             waits = handing_over & ~flies & (config.apg_cotangent_norm is None)

@@ -134,13 +134,11 @@ def train(
     abstract = sharding.abstract_sharded(mesh, target)
     members: list[Member] = []
     saving = ThreadPoolExecutor(1, "checkpoint")
-    executor = ThreadPoolExecutor(1)  # compiles one program after the other, the first that is needed first
+    executor = ThreadPoolExecutor(2)  # compiles programs, the first that is needed first
     try:
         yield Compiling()
         first, second, last = ("apg", "fly", "train") if run.learner.all_apg else ("train", "fly", "apg")
-        compiled = {
-            name: executor.submit(driver.lower(trainer, name, abstract, inputs, store)) for name in (first, second)
-        }
+        compiled = {first: executor.submit(driver.lower(trainer, first, abstract, inputs, store))}
         begin, states, clock, rows = 0, None, Clock(), [[] for _ in folders]
         if resume:
             begin, states, clock, rows, notes = _resume(trainer, folders, configs, target)
@@ -148,6 +146,7 @@ def train(
         if states is None:
             states = init(driver.seeds(run.seed, run.seeds), inputs)
             states = _beginning_with(states, *policy()) if policy else states
+        compiled[second] = executor.submit(driver.lower(trainer, second, abstract, inputs, store))
         # The last is traced there, too, while training goes on.
         compiled[last] = executor.submit(lambda: driver.lower(trainer, last, abstract, inputs, store)())
         for i, folder in enumerate(folders):
@@ -163,7 +162,7 @@ def train(
                 yield LearningExtended({run.seed + i: steps for i, steps in chunk.extended.items()})
         recorder.finish()
         if begin == run.learner.num_unrolls * run.learner.steps_per_unroll:
-            flights = programs.gather(programs.fly()(states.learner, inputs, driver.report_starts(run.learner)))
+            flights = programs.gather(programs.fly()(states.learner, inputs))
             yield Finished(flights, [member.rows for member in members])
     finally:
         executor.shutdown(cancel_futures=True)

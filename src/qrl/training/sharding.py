@@ -92,6 +92,9 @@ def sum_over_shards(mesh: Mesh | None, values: Any) -> Any:
 def map_members(one: Callable[[Any], Any], members: Any) -> Any:
     """`one` of each member; on a CPU one after the other (`lax.map`), which is faster there than `vmap`."""
     count = len(jax.tree.leaves(members)[0])
+    if count == 1:  # a loop that is passed once still takes its time to compile
+        alone = one(jax.tree.map(lambda x: jax.lax.squeeze(x, (0,)), members))
+        return jax.tree.map(lambda x: jax.lax.expand_dims(x, (0,)), alone)
     return jax.lax.map(one, members) if sequential_members(count) else jax.vmap(one)(members)
 
 

@@ -75,14 +75,21 @@ class Program(NamedTuple):
         like = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.exported.out_avals]
         return jax.tree.unflatten(self.structure, like)
 
-    def compile(self, args: tuple[Any, ...], options: dict[str, Any], donated: int | None = None) -> Callable[..., Any]:
-        """Compiled for arguments like `args`; the one at `donated` may be overwritten."""
+    def lower(
+        self, args: tuple[Any, ...], options: dict[str, Any], donated: int | None = None
+    ) -> Callable[[], Callable[..., Any]]:
+        """What compiles it for arguments like `args`; the one at `donated` may be overwritten."""
         sizes = [len(jax.tree.leaves(x)) for x in args]
         first = sum(sizes[:donated])
         given = () if donated is None else tuple(range(first, first + sizes[donated]))
         jitted = jax.jit(self.exported.call, donate_argnums=given, compiler_options=options)
-        compiled = jitted.lower(*jax.tree.leaves(args)).compile()
-        return lambda *args: jax.tree.unflatten(self.structure, compiled(*jax.tree.leaves(args)))
+        lowered = jitted.lower(*jax.tree.leaves(args))
+
+        def compiled() -> Callable[..., Any]:
+            program = lowered.compile()
+            return lambda *args: jax.tree.unflatten(self.structure, program(*jax.tree.leaves(args)))
+
+        return compiled
 
 
 def find(store: Store, name: str, args: tuple[Any, ...]) -> Program | None:

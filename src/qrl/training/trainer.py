@@ -73,7 +73,7 @@ def init_state(setup: Setup, seed: chex.Array, inputs: MemberInputs) -> TrainSta
         learner.initial_memory(setup.spec, len(lane_ids)),
     )
     first = learner.init(setup.spec, hyper, learner_key)
-    _, transitions = jax.eval_shape(lambda *x: collect(setup, hyper, *x), first, lanes, key, start_key)
+    transitions = rollout.transitions_of(lanes, setup.env.action_size, config.unroll_length)
     buffer = replay_buffer.create(transitions, config.replay_unrolls)
     zero = jnp.float32(0.0)
     metrics = UpdateMetrics(*[zero] * len(UpdateMetrics._fields))
@@ -352,12 +352,17 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
         # `init` runs once.
         return xla_effort(0 if name == "init" else 1, config.num_envs if name == "train" else 0)
 
+    def gather(tree: Any) -> Any:
+        if not all(x.is_fully_addressable for x in jax.tree.leaves(tree)):
+            return jax.tree.map(np.asarray, replicate(tree))
+        return jax.tree.map(np.array, tree)  # a live view of a device array would cancel its donation
+
     def members(states: TrainState) -> Iterator[TrainState]:
         count = len(states.unrolls)
         if not states.unrolls.is_fully_addressable:  # one at a time: all of a member is brought to every process
             yield from (jax.tree.map(np.asarray, one_member(states, i)) for i in range(count))
             return
-        copy = jax.tree.map(np.array, states)  # a live view of a device array would cancel its donation
+        copy = gather(states)
         yield from (jax.tree.map(lambda x, i=i: x[i], copy) for i in range(count))
 
     def jitted(name: str, program: Callable[..., Any]) -> Any:
@@ -370,7 +375,7 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
         apg=jitted("apg", over_mesh(apg, steps)),
         fly=jitted("fly", fly_padded),
         effort=effort,
-        gather=lambda tree: jax.tree.map(np.asarray, replicate(tree) if mesh else tree),
+        gather=gather,
         members=members,
     )
 
