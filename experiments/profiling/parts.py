@@ -90,9 +90,8 @@ def layers(sizes: list[int]) -> int:
 
 def acting_parts(trainer: Trainer, inputs: Inputs) -> list[Part]:
     adds = pass_adds(trainer)[0] * trainer.config.steps_per_unroll
-    slot = jax.tree.map(lambda x: x[0], inputs.state.buffer.data)
     return [
-        Part("acting", act, adds=adds, first=(inputs.state.lanes, slot)),
+        Part("acting", act, adds=adds, first=(inputs.state.lanes, inputs.state.buffer)),
         Part("– policy", act_policy, adds=adds),
         Part("– noise", draw_noise),
         Part("– physics, reward", step_physics),
@@ -101,16 +100,15 @@ def acting_parts(trainer: Trainer, inputs: Inputs) -> list[Part]:
 
 
 def act(trainer: Trainer, call: Call) -> Any:
-    lanes, _ = call.last
+    lanes, buffer = call.last
     state, key = call.inputs.state, jax.random.fold_in(call.inputs.state.key, call.i)
-    return collect(trainer.setup, call.inputs.member.hyper, state.learner, lanes, key, state.start_key)
+    return collect(trainer.setup, call.inputs.member.hyper, state.learner, lanes, buffer, key, state.start_key)
 
 
-def newest_unroll(trainer: Trainer, inputs: Inputs) -> Any:
+def newest_unroll(inputs: Inputs) -> Any:
     """The newest unroll's observations and actions, [T, N, ...]."""
-    newest = (inputs.state.buffer.inserted - 1) % trainer.config.replay_unrolls
-    data: Any = inputs.state.buffer.data
-    return [jnp.swapaxes(x[newest], 0, 1) for x in (data.observation, data.action)]
+    newest: Any = replay_buffer.newest(inputs.state.buffer)
+    return [jnp.swapaxes(x, 0, 1) for x in (newest.observation, newest.action)]
 
 
 def act_policy(trainer: Trainer, call: Call) -> Any:
@@ -120,7 +118,7 @@ def act_policy(trainer: Trainer, call: Call) -> Any:
     def step(_: None, observation: chex.Array) -> Any:
         return None, learner.act(trainer.setup.spec, hyper, state, (), observation)[1]
 
-    return jax.lax.scan(step, None, newest_unroll(trainer, call.inputs)[0])[1]
+    return jax.lax.scan(step, None, newest_unroll(call.inputs)[0])[1]
 
 
 def draw_noise(trainer: Trainer, call: Call) -> Any:
@@ -134,7 +132,7 @@ def step_physics(trainer: Trainer, call: Call) -> Any:
         state = jax.vmap(trainer.setup.env.step)(state, jnp.clip(action, -1.0, 1.0))
         return state, (state.obs, state.reward, state.done)
 
-    return jax.lax.scan(step, call.inputs.state.lanes.state, newest_unroll(trainer, call.inputs)[1] + call.tiny)
+    return jax.lax.scan(step, call.inputs.state.lanes.state, newest_unroll(call.inputs)[1] + call.tiny)
 
 
 def draw_starts(trainer: Trainer, call: Call) -> Any:
@@ -150,16 +148,10 @@ def draw_starts(trainer: Trainer, call: Call) -> Any:
 def minibatch_parts(trainer: Trainer, inputs: Inputs) -> list[Part]:
     updates = trainer.config.updates_per_unroll
     return [
-        Part("replay buffer: add", add, first=inputs.state.buffer),
         Part("draws of minibatches and symmetries", sample),
         Part("replay buffer: gather", gather, updates),
         Part("symmetries", augment, updates),
     ]
-
-
-def add(trainer: Trainer, call: Call) -> Any:
-    slot = jax.tree.map(lambda x: x[0], call.inputs.state.buffer.data)
-    return replay_buffer.add(call.last, perturb(slot, call.tiny))
 
 
 def sample(trainer: Trainer, call: Call) -> Any:

@@ -32,7 +32,7 @@ from jax.sharding import NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from qrl import request, tasks
-from qrl.algorithm import replay_buffer, rollout
+from qrl.algorithm import rollout
 from qrl.runs import record
 from qrl.training import devices, driver
 from qrl.training.sharding import LAYOUT, MEMBER, SHARD, make_mesh, shard_map
@@ -76,8 +76,7 @@ def acting(
         def unroll(i: Any, carry: Any) -> Any:
             lanes, buffer = carry
             noise_key = jax.random.fold_in(key, i)
-            lanes, transitions = collect(trainer.setup, inputs.hyper, learner, lanes, noise_key, start_key)
-            return lanes, replay_buffer.add(buffer, transitions)
+            return collect(trainer.setup, inputs.hyper, learner, lanes, buffer, noise_key, start_key)
 
         return jax.tree.map(lambda x: x[None], jax.lax.fori_loop(0, unrolls, unroll, one))
 

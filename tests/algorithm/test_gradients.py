@@ -19,6 +19,7 @@ from qrl.algorithm import learner as algorithm
 from qrl.algorithm import replay_buffer
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerState, UpdateMetrics
+from qrl.algorithm.replay_buffer import ReplayBuffer
 from qrl.algorithm.types import Networks, Transition
 from qrl.config import Config, Hyperparameters, load_preset
 from qrl.training import trainer
@@ -359,7 +360,7 @@ def test_ppos_passes_are_a_literal_loop(monkeypatch: pytest.MonkeyPatch) -> None
     data = data._replace(log_mu=np.asarray(log_pi(learner.hyper, 0.25, state.params.policy, data)))
     order = np.random.default_rng(8).permuted(np.tile(np.arange(B), (PASSES, 1)), axis=1).reshape(-1, 2)
     monkeypatch.setattr(replay_buffer, "epochs", lambda *_: jnp.asarray(order))
-    buffer = replay_buffer.add(replay_buffer.create(data, 1), data)
+    buffer = ReplayBuffer(jax.tree.map(lambda x: jnp.asarray(x)[None], data), jnp.int32(1))
     setup, inputs = Setup(adapt(Sized()), learner.config), MemberInputs(learner.hyper, ())
     updates = jax.jit(lambda state, key: trainer._updates(setup, inputs, state, buffer, key))
     after, metrics = updates(state, jax.random.PRNGKey(0))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from bound_learner import BoundLearner
-from qrl.algorithm.learner import LearnerState, UpdateMetrics
+from qrl.algorithm import learner as algorithm
+from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
 from qrl.algorithm.types import Transition
 from qrl.config import Config, Hyperparameters, load_preset
 
@@ -201,6 +202,40 @@ def test_other_values_make_the_learner_that_has_them(traced: tuple) -> None:
     there, data = BoundLearner(config(**changes), F, A), batch()
     here = BoundLearner(config(), F, A).with_hyper(there.config.hyperparameters)
     np.testing.assert_array_equal(losses(here, data), losses(there, data))
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize(("hidden", "gru"), [((7, 6), None), ((7,), 6)], ids=["MLP", "GRU"])
+@pytest.mark.parametrize("seen", [None, 3])
+def test_weights_that_have_the_scale_act_alike(
+    hidden: tuple[int, ...], gru: int | None, seen: int | None, normalize: bool
+) -> None:
+    """Without a scale of observations; with the policy that has it in its weights, not with the same."""
+    networks = {"policy_hidden_layer_sizes": hidden, "policy_gru_size": gru, "symmetries": not gru}
+    scale = [0.5, 2.0, 3.0, 0.1, 5.0]
+    here = config(observation_scale=scale, normalize_observations=normalize, **networks)
+    spec = LearnerSpec(here, F, A, policy_observation_size=seen)
+    state = algorithm.init(spec, here.hyperparameters, jax.random.PRNGKey(1))
+    hyper, scaled = algorithm.with_scale_in_weights(spec, here.hyperparameters, state)
+    assert hyper.observation_scale is None
+    observation, memory = jax.random.normal(jax.random.PRNGKey(2), (9, F)), algorithm.initial_memory(spec, 9)
+    expected = algorithm.act(spec, here.hyperparameters, state, memory, observation)
+    found = algorithm.act(spec, hyper, scaled, memory, observation)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-7), found, expected)
+    assert not np.allclose(algorithm.act(spec, hyper, state, memory, observation)[1], expected[1], rtol=1e-2)
+
+
+def test_a_scale_stays_where_the_policy_has_a_view_of_its_own() -> None:
+    """Or where there is none."""
+    here = config(observation_scale=[2.0] * F)
+    spec = LearnerSpec(here, F, A, policy_view=lambda observation: observation[..., ::-1])
+    state = algorithm.init(spec, here.hyperparameters, jax.random.PRNGKey(1))
+    unchanged = algorithm.with_scale_in_weights(spec, here.hyperparameters, state)
+    assert unchanged[0].observation_scale is not None
+    assert unchanged[1] is state
+    plain = config().hyperparameters
+    assert plain.observation_scale is None
+    assert algorithm.with_scale_in_weights(LearnerSpec(config(), F, A), plain, state)[1] is state
 
 
 @pytest.mark.parametrize("normalize", [False, True])

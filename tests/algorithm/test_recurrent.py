@@ -12,6 +12,7 @@ import pytest
 from brax.envs.base import Env, State
 from pydantic import ValidationError
 
+import collecting
 import small_run
 from fault_injection import assert_same_leaves, leaves
 from qrl.algorithm import analytic_gradient, learner, networks, rollout
@@ -139,7 +140,7 @@ def collected(spec: LearnerSpec, state: Any, unrolls: int) -> list[Any]:
     memory = learner.initial_memory(spec, LANES)
     lanes = rollout.init(env, jax.random.PRNGKey(6), jnp.arange(LANES), LANES, 12, T, memory)
     unroll = jax.jit(
-        lambda lanes, key: rollout.unroll(
+        lambda lanes, key: collecting.unroll(
             env,
             lanes,
             partial(learner.act, spec, hyper, state),

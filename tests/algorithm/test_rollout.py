@@ -13,7 +13,8 @@ import pytest
 from brax.envs.base import Env, State
 from scipy import stats
 
-from qrl.algorithm import rollout
+import collecting
+from qrl.algorithm import replay_buffer, rollout
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.carried import lanes_last
 from qrl.algorithm.rollout import Lanes
@@ -112,7 +113,7 @@ def begin_of(env: Env) -> Callable[[jax.Array], Lanes]:
 def unroll_of(env: Env) -> Callable[..., tuple[Lanes, Transition]]:
     sigma = jnp.float32(SIGMA)
     return jax.jit(
-        lambda lanes, key, starts: rollout.unroll(
+        lambda lanes, key, starts: collecting.unroll(
             adapt(env),
             lanes,
             lambda memory, o: (memory, mean(o)),
@@ -507,7 +508,7 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
         key = jax.random.PRNGKey(3)
         begun = rollout.init(adapt(env), key, jnp.arange(lanes), lanes, LONGEST, T)
         mean, sigma = (lambda observation: jnp.zeros((*observation.shape[:-1], env.action_size))), jnp.float32(0.5)
-        after, steps = rollout.unroll(
+        after, steps = collecting.unroll(
             adapt(env),
             begun,
             lambda memory, o: (memory, mean(o)),
@@ -525,6 +526,40 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), in_blocks, at_once)
 
 
+def test_an_unroll_is_written_into_the_next_slot_alone() -> None:
+    """The others keep what they hold; so twice around the ring."""
+    env, key, sigma = adapt(MARKED), jax.random.PRNGKey(4), jnp.float32(SIGMA)
+    lanes = rollout.init(env, key, jnp.arange(LANES), LANES, LONGEST, T)
+    ring = replay_buffer.create(rollout.transitions_of(lanes, env.action_size, T), 3)
+    written = jax.jit(
+        lambda lanes, ring, key: rollout.unroll(
+            env, lanes, ring, lambda memory, o: (memory, mean(o)), sigma, key, key, max_episode_steps=LONGEST
+        )
+    )
+    for i in range(6):
+        before = ring
+        lanes, ring = written(lanes, ring, jax.random.PRNGKey(i))
+        assert int(ring.inserted) == i + 1
+        newest = replay_buffer.newest(ring)
+        for now, then, new in zip(ring.data, before.data, newest, strict=True):
+            if isinstance(now, tuple):  # no memory
+                continue
+            np.testing.assert_array_equal(now[i % 3], new)
+            np.testing.assert_array_equal(np.delete(now, i % 3, 0), np.delete(then, i % 3, 0))
+        assert np.abs(newest.observation).max(axis=-1).min() > 0
+
+
+def test_rows_are_chosen_as_by_where() -> None:
+    """Bit for bit, whatever the other number is."""
+    odd = np.array([0.0, -0.0, np.inf, -np.inf, np.nan, 1.0, -1.0, 1e-45], np.float32)
+    x, other = (np.asarray(a) for a in np.meshgrid(odd, odd))
+    for chosen in (np.arange(8) % 2 == 0, np.zeros(8, bool), np.ones(8, bool)):
+        found = jax.jit(rollout._chosen_rows)(chosen[:, None], x, other)
+        np.testing.assert_array_equal(
+            np.asarray(found).view(np.uint32), np.where(chosen[:, None], x, other).view(np.uint32)
+        )
+
+
 def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
     """Our own environment, with bounds so near that most lanes leave them: the loop's steps, never a termination."""
     near = {"start": {"position_m": 1.5, "velocity_m_s": 9.0}, "evaluation": {"start": {"position_m": 1.5}}}
@@ -537,7 +572,7 @@ def test_a_quadrotor_that_flees_is_truncated_and_starts_afresh() -> None:
     @jax.jit
     def run(key: jax.Array) -> tuple[Lanes, Transition]:
         lanes = rollout.init(adapt(env), key, jnp.arange(4), 4, 100, 50)
-        return lanes, rollout.unroll(
+        return lanes, collecting.unroll(
             adapt(env),
             lanes,
             lambda memory, o: (memory, still(o)),

@@ -69,7 +69,7 @@ def done(tmp_path_factory: pytest.TempPathFactory, compiled: list[str]) -> Path:
 def test_one_program_for_points_that_differ_in_traced_values(done: Path) -> None:
     """Step sizes and masses travel: training was compiled once, and so were its first state and evaluation."""
     names = json.loads((done.parent / "compiled.json").read_text())
-    for program in ("init", "train", "fly_padded"):
+    for program in ("init", "train", "fly"):
         assert names.count(f"jit({program})") == 1, names
 
 

@@ -61,10 +61,11 @@ def spy(monkeypatch: pytest.MonkeyPatch) -> Seen:
         watched(name)
 
     def unroll(*args: Any, **kwargs: Any) -> Any:
-        lanes, transitions = original_unroll(*args, **kwargs)
-        policy, sigma = args[2:4]
+        lanes, buffer = original_unroll(*args, **kwargs)
+        policy, sigma = args[3:5]
+        transitions = replay_buffer.newest(buffer)
         seen.value("noise", (transitions.action - policy((), transitions.observation)[1]) / sigma)
-        return lanes, transitions
+        return lanes, buffer
 
     def gather(buffer: Any, index: jax.Array) -> Any:
         seen.value("minibatch", index)

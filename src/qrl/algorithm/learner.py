@@ -134,6 +134,22 @@ def act(
     return networks.step(spec.policy, state.params.policy, memory, seen)
 
 
+def with_scale_in_weights(
+    spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState
+) -> tuple[Hyperparameters, LearnerState]:
+    """Hyperparameters and a state with which `act` does the same, to rounding, without multiplying each observation by
+    `observation_scale`: the policy's first layer has it in its weights. Unchanged where what the policy network is
+    given is another view of observations.
+    """
+    if hyper.observation_scale is None:
+        return hyper, state
+    scale = hyper.observation_scale[: spec.policy_observation_size]
+    if spec.policy_view(scale) is not scale:
+        return hyper, state
+    policy = networks.scale_inputs(spec.policy, state.params.policy, scale)
+    return hyper._replace(observation_scale=None), state._replace(params=state.params._replace(policy=policy))
+
+
 def deployed(spec: LearnerSpec, state: LearnerState) -> LearnerState:
     """The state with the deployed policy's parameters: their average, once averaging has begun."""
     if not spec.config.average_fraction:

@@ -182,6 +182,13 @@ def apply(network: Network, params: Any, *inputs: chex.Array, method: str = "__c
     return network.apply(params, *inputs, method=method)
 
 
+def scale_inputs(network: Network, params: Any, scale: chex.Array) -> Any:
+    """Parameters with which a network makes of x what `params` make of x · scale [F], to rounding."""
+    first = "layers_0" if isinstance(network, GRU) else "Dense_0"
+    layer = params["params"][first]
+    return {"params": params["params"] | {first: layer | {"kernel": layer["kernel"] * scale[:, None]}}}
+
+
 def init(network: Network, key: chex.PRNGKey, x: chex.Array) -> Any:
     """Parameters of a network of inputs like x [..., F]."""
     if isinstance(network, GRU):

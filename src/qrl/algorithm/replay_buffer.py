@@ -22,14 +22,30 @@ def create(unroll: chex.ArrayTree, slots: int) -> ReplayBuffer:
     return ReplayBuffer(jax.tree.map(lambda x: jnp.zeros((slots, *x.shape), x.dtype), unroll), jnp.int32(0))
 
 
-def add(buffer: ReplayBuffer, unroll: chex.ArrayTree) -> ReplayBuffer:
-    """Write `unroll` into the next slot."""
-    slots = jax.tree.leaves(buffer.data)[0].shape[0]
-    slot = buffer.inserted % slots
-    data = jax.tree.map(
-        lambda d, x: jax.lax.dynamic_update_index_in_dim(d, x.astype(d.dtype), slot, 0), buffer.data, unroll
-    )
-    return ReplayBuffer(data, buffer.inserted + 1)
+def slot(buffer: ReplayBuffer) -> chex.Array:
+    """Where the next unroll belongs; int32 []."""
+    return buffer.inserted % _slots(buffer)
+
+
+def write(
+    data: chex.Array, values: chex.Array, slot: chex.Array, lane: chex.Array, step: chex.Array | None = None
+) -> chex.Array:
+    """A leaf of `data` [slots, N, T, ...] with the values [n, ...] of n lanes, the first of which is `lane`, at a step;
+    without a step `values` are [n, T, ...], or of a leaf without time axis. In place, where nothing else needs it.
+    """
+    values = jnp.expand_dims(values, 0 if step is None else (0, 2)).astype(data.dtype)
+    first = [slot, lane, *([] if step is None else [step])]
+    return jax.lax.dynamic_update_slice(data, values, first + [0] * (data.ndim - len(first)))
+
+
+def newest(buffer: ReplayBuffer) -> chex.ArrayTree:
+    """The unroll that was added last; leaves [N, T, ...]."""
+    last = (buffer.inserted - 1) % _slots(buffer)
+    return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, last, keepdims=False), buffer.data)
+
+
+def _slots(buffer: ReplayBuffer) -> int:
+    return jax.tree.leaves(buffer.data)[0].shape[0]
 
 
 def sample(buffer: ReplayBuffer, keys: chex.PRNGKey, minibatches: int, each: int) -> chex.Array:

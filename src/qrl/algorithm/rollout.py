@@ -14,12 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.random import threefry_2x32
 
+from qrl.algorithm import replay_buffer
 from qrl.algorithm.carried import Carried, Carry, lanes_first, lanes_last
 from qrl.algorithm.networks import log_density
+from qrl.algorithm.replay_buffer import ReplayBuffer
 from qrl.algorithm.types import State, TaskEnv, Transition, info_flag
 from qrl_envs.fusion import stored
 
 TRUNCATIONS = "truncated", "truncation", "out_of_bounds"  # of an environment's `info`
+WIDE, UNTIMED = ("observation", "action"), ("final_observation", "memory")  # fields of a `Transition`
 BLOCK_LANES = 512  # most lanes stepped at a time on a CPU: with more, what passes between steps leaves its cache
 
 
@@ -130,7 +133,7 @@ class Steps:
 
         lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes, cheap=False)
         return lanes._replace(
-            state=jax.tree.map(jnp.where, lanes.state.each(lanes.done), lanes.next_state, lanes.state),
+            state=_chosen(lanes.done, lanes.next_state, lanes.state),
             steps=jnp.where(lanes.done, 0, lanes.steps),
             done=jnp.zeros_like(lanes.done),
             next_state_used=lanes.next_state_used | lanes.done,
@@ -142,6 +145,22 @@ class Steps:
         states = self._carried.unpack(carry, constant)
         after = self._env.step_lanes(states, stored(jnp.clip(action, -1.0, 1.0).T))
         return self._carried.follow(carry, after), after
+
+
+def _chosen(chosen: chex.Array, carry: Carry, other: Carry) -> Carry:
+    """`carry` in the lanes `chosen` [n], else `other`."""
+    observation = _chosen_rows(chosen[:, None], carry.observation, other.observation)
+    return jax.tree.map(jnp.where, carry.each(chosen), carry, other)._replace(observation=observation)
+
+
+def _chosen_rows(chosen: chex.Array, x: chex.Array, other: chex.Array) -> chex.Array:
+    """`x` [n, F] where `chosen` [n, 1], else `other`, by their bits: of a selection along so short an axis LLVM makes a
+    load from one of two places for each number, not of several at a time.
+    """
+    unsigned = jnp.dtype(f"uint{8 * x.dtype.itemsize}")
+    mask = jnp.where(chosen, ~unsigned.type(0), unsigned.type(0))
+    bits, others = (jax.lax.bitcast_convert_type(each, unsigned) for each in (x, other))
+    return jax.lax.bitcast_convert_type(bits & mask | others & ~mask, x.dtype)
 
 
 def _results(state: State) -> Any:
@@ -213,73 +232,79 @@ def _step(
 def unroll(
     env: TaskEnv,
     lanes: Lanes,
+    buffer: ReplayBuffer,
     policy: Policy,
     sigma: chex.Array,
     noise_key: chex.PRNGKey,
     start_key: chex.PRNGKey,
     *,
-    unroll_length: int,
     max_episode_steps: int,
-) -> tuple[Lanes, Transition]:
+) -> tuple[Lanes, ReplayBuffer]:
     """T steps of every lane under mu = N(mean, sigma²·I), where policy(memory, observation) gives the next memory and
-    the mean; transitions with leaves [N, T, ...], but for the last two of `Transition`.
+    the mean; its transitions are written into the next slot of `buffer`, whose data are a `Transition`.
 
     The environment gets the action clipped to [−1, 1]; the transition keeps it as drawn. An episode's last step is
     `truncated` where it reached `max_episode_steps` or where the environment's `info` says so ("truncation",
     "truncated", "out_of_bounds"), else `terminated`. `noise_key` is this unroll's own; `start_key` is that of `init`.
     """
-
     count = lanes.lane_id.shape[0]
     num_blocks = _num_blocks(count)
     size = count // num_blocks
     blocks = jax.tree.map(lambda x: x.reshape(num_blocks, size, *x.shape[1:]), lanes)
-    first = jax.tree.map(lambda x: x[0], blocks) if num_blocks > 1 else lanes
-    steps = Steps(env, first)
-    # Jitted, so that it is traced once for its shapes and for the loop.
-    step = jax.jit(functools.partial(_step, steps, policy, sigma, start_key, max_episode_steps), inline=True)
+    slot, unroll_length = replay_buffer.slot(buffer), buffer.data.reward.shape[2]
+    steps = Steps(env, jax.tree.map(lambda x: x[0], blocks) if num_blocks > 1 else lanes)
 
-    def begin(lanes: Lanes) -> tuple[State, UnrollCarry]:
-        none, packed = jnp.zeros_like(lanes.done), steps.pack(lanes)
-        final = jnp.zeros_like(packed.state.observation)
-        return lanes_last(lanes.state), UnrollCarry(packed, truncated=none, found=none, final_observation=final)
-
-    def unroll_block(record: Transition, block: tuple[chex.Array, Lanes]) -> tuple[Transition, Any]:
-        """T steps of the lanes of one block [n], written into the record of all in place."""
-        index, lanes = block
+    def unroll_block(data: Transition, block: tuple[chex.Array, Lanes]) -> tuple[Transition, Lanes]:
+        """T steps of the lanes of one block [n]."""
+        first_lane, lanes = block
+        write = functools.partial(replay_buffer.write, slot=slot, lane=first_lane)
+        constant = lanes_last(lanes.state)
         # Zeros in a lane that is about to restart.
         memory = jax.tree.map(lambda x: jnp.where(lanes.done[:, None], 0.0, x), lanes.memory)
 
-        def write_step(carry: tuple[UnrollCarry, Transition], at: tuple[chex.Array, chex.Array]) -> tuple[Any, None]:
-            (now, record), (t, noise) = carry, at
-            now, transition = step(constant, now, noise)
-            return (now, jax.tree.map(functools.partial(_write, index, t), record, transition)), None
+        def write_step(carry: tuple[UnrollCarry, Any], at: tuple[chex.Array, chex.Array]) -> tuple[Any, Any]:
+            (now, wide), (t, noise) = carry, at
+            now, transition = _step(steps, policy, sigma, start_key, max_episode_steps, constant, now, noise)
+            wide = jax.tree.map(functools.partial(write, step=t), wide, _wide(transition))
+            return (now, wide), _narrow(transition)
 
         noise = normal(noise_key, lanes.lane_id, unroll_length, env.action_size)
-        times = jnp.arange(unroll_length), noise
-        constant, now = begin(lanes)
-        (last, record), _ = jax.lax.scan(write_step, (now, record), times)
+        none, packed = jnp.zeros_like(lanes.done), steps.pack(lanes)
+        final = jnp.zeros_like(packed.state.observation)
+        now = UnrollCarry(packed, truncated=none, found=none, final_observation=final)
+        (last, wide), narrow = jax.lax.scan(write_step, (now, _wide(data)), (jnp.arange(unroll_length), noise))
         bootstrapped = last.truncated | ~last.lanes.done
-        final = jnp.where(bootstrapped[:, None], last.lanes.state.observation, 0.0)
-        after = steps.unpack(last.lanes, lanes)
-        return record, (after, jnp.stack([last.final_observation, final], axis=1), memory)
+        at_end = jnp.where(bootstrapped[:, None], last.lanes.state.observation, 0.0)
+        ends = jnp.stack([last.final_observation, at_end], axis=1), memory
+        final, memory = jax.tree.map(write, (data.final_observation, data.memory), ends)
+        narrow = jax.tree.map(lambda old, x: write(old, x.T), _narrow(data), narrow)
+        return Transition(**wide, **narrow, final_observation=final, memory=memory), steps.unpack(last.lanes, lanes)
 
-    of_step = jax.eval_shape(step, *begin(first), jnp.zeros((size, env.action_size)))[1]
-    record = jax.tree.map(lambda x: jnp.zeros((num_blocks, size, unroll_length, *x.shape[1:]), x.dtype), of_step)
     if num_blocks == 1:  # a loop that is passed once still takes its time to compile
-        record, after = unroll_block(record, (jnp.int32(0), lanes))
+        data, lanes = unroll_block(buffer.data, (jnp.int32(0), lanes))
     else:
-        record, after = jax.lax.scan(unroll_block, record, (jnp.arange(num_blocks), blocks))
-        after = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), after)
-    record = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), record)
-    lanes, final, memory = after
-    return lanes, record._replace(final_observation=final, memory=memory)
+        data, blocks = jax.lax.scan(unroll_block, buffer.data, (jnp.arange(num_blocks) * size, blocks))
+        lanes = jax.tree.map(lambda x: x.reshape(count, *x.shape[2:]), blocks)
+    return lanes, ReplayBuffer(data, buffer.inserted + 1)
+
+
+def _wide(transition: Transition) -> Any:
+    """The part that is written at each step, [n, ...]."""
+    return {name: getattr(transition, name) for name in WIDE}
+
+
+def _narrow(transition: Transition) -> Any:
+    """The part with one number a lane and step, which is written at the end, [T, n] transposed: by itself each would
+    take a line of the cache.
+    """
+    return {name: x for name, x in transition._asdict().items() if name not in (*WIDE, *UNTIMED)}
 
 
 def transitions_of(lanes: Lanes, action_size: int, unroll_length: int) -> Transition:
     """Shapes and types of what `unroll` records of lanes like these, without tracing a step."""
     state, count = lanes.state, lanes.done.shape[0]
 
-    def each(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+    def each(*shape: int, dtype: Any = jnp.float32) -> Any:
         return jax.ShapeDtypeStruct((count, *shape), dtype)
 
     features, seen = state.obs.shape[-1], state.obs.dtype
@@ -302,12 +327,6 @@ def _num_blocks(count: int) -> int:
     block = max(size for size in range(1, BLOCK_LANES + 1) if count % size == 0)
     in_blocks = jax.default_backend() == "cpu" and count > BLOCK_LANES and block >= BLOCK_LANES // 8
     return count // block if in_blocks else 1
-
-
-def _write(block: chex.Array, step: chex.Array, record: chex.Array, x: chex.Array) -> chex.Array:
-    """The record [blocks, n, T, ...] with `x` [n, ...] as one step of a block."""
-    at = [block, 0, step, *[0] * (x.ndim - 1)]
-    return jax.lax.dynamic_update_slice(record, jnp.expand_dims(x, (0, 2)), at)
 
 
 def normal(key: chex.PRNGKey, lane_id: chex.Array, steps: int, size: int) -> chex.Array:

@@ -19,6 +19,7 @@ from qrl.algorithm import analytic_gradient, augmentation, flights, learner, rep
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.flights import Flights
 from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
+from qrl.algorithm.replay_buffer import ReplayBuffer
 from qrl.algorithm.rollout import Lanes
 from qrl.algorithm.types import Env, TaskEnv, Transition
 from qrl.config import Config, Hyperparameters
@@ -100,18 +101,20 @@ def collect(
     hyper: Hyperparameters,
     state: LearnerState,
     lanes: Lanes,
+    buffer: ReplayBuffer,
     noise_key: chex.PRNGKey,
     start_key: chex.PRNGKey,
-) -> tuple[Lanes, Transition]:
+) -> tuple[Lanes, ReplayBuffer]:
     spec = setup.spec
+    acting = learner.with_scale_in_weights(spec, hyper, state)
     return rollout.unroll(
         setup.env,  # of any parameters: each lane carries its own
         lanes,
-        partial(learner.act, spec, hyper, state),
+        buffer,
+        partial(learner.act, spec, *acting),
         learner.sigma(hyper, state),
         noise_key,
         start_key,
-        unroll_length=setup.config.unroll_length,
         max_episode_steps=setup.max_episode_steps,
     )
 
@@ -119,9 +122,9 @@ def collect(
 def train_step(setup: Setup, inputs: MemberInputs, state: TrainState) -> TrainState:
     """One unroll of all lanes into the replay buffer, and the updates that follow it (Algorithm 2)."""
     noise_key, sample_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
-    lanes, transitions = collect(setup, inputs.hyper, state.learner, state.lanes, noise_key, state.start_key)
+    lanes, buffer = collect(setup, inputs.hyper, state.learner, state.lanes, state.buffer, noise_key, state.start_key)
+    transitions = replay_buffer.newest(buffer)
     observed = learner.update_statistics(setup.spec, state.learner, transitions.observation, transitions.reward)
-    buffer = replay_buffer.add(state.buffer, transitions)
     learned, metrics = jax.lax.cond(
         state.unrolls + 1 >= setup.config.warmup_unrolls,
         lambda now: _updates(setup, inputs, now, buffer, sample_key),
@@ -152,7 +155,7 @@ def train_step(setup: Setup, inputs: MemberInputs, state: TrainState) -> TrainSt
 
 
 def _updates(
-    setup: Setup, inputs: MemberInputs, state: LearnerState, buffer: replay_buffer.ReplayBuffer, key: chex.PRNGKey
+    setup: Setup, inputs: MemberInputs, state: LearnerState, buffer: ReplayBuffer, key: chex.PRNGKey
 ) -> tuple[LearnerState, chex.Array]:
     """The updates of one unroll on augmented minibatches, and their metrics [updates, len(UpdateMetrics)]."""
     config, env = setup.config, setup.env_of(inputs)
