@@ -41,7 +41,7 @@ FEWER_STARTS = 100  # of each seed, where there are more than a few
 MANY_SEEDS = 16
 RESERVED_SECONDS = 12.0  # of a section's time, for what comes after training
 CACHE_HIT = "/jax/compilation_cache/cache_hits"
-COPIES = 3  # of an unroll in memory: recorded, in the replay buffer, and one to spare
+COPIES = 3  # of an unroll in memory: in the replay buffer, what a step's numbers are turned from, and one to spare
 
 
 class Sizes(NamedTuple):
@@ -201,13 +201,15 @@ def train(sizes: Sizes, task: str, count: int) -> None:
     trainer, inputs = make_trainer_of(run_of(task, preset=f"{task}_gpu"), count)
     config = trainer.config
     states = jax.block_until_ready(trainer.init(driver.seeds(FIRST_SEED, count), inputs))
-    # Not what they record: gigabytes, of many seeds.
-    flights = driver.report_flights(trainer).__wrapped__
-    flown = lambda *args: flights(*args)._replace(observations=(), actions=())  # noqa: E731
-    fly = jax.jit(flown, compiler_options=trainer.effort("fly"))
+
+    def without_records(fly: Any) -> Any:
+        """Flights without what they record: gigabytes, of many seeds."""
+        bare = lambda *args: fly.__wrapped__(*args)._replace(observations=(), actions=())  # noqa: E731
+        return jax.jit(bare, compiler_options=trainer.effort("fly"))
+
     with ThreadPoolExecutor() as pool:
         apg = pool.submit(driver.compile_apg, trainer, states, inputs)
-        reports = pool.submit(fly.lower(states.learner, inputs).compile)
+        reports = pool.submit(without_records(driver.report_flights(trainer)).lower(states.learner, inputs).compile)
         programs = driver.Programs(
             pool.submit(driver.compile_train, trainer, states, inputs).result,
             apg.result,
@@ -226,7 +228,7 @@ def train(sizes: Sizes, task: str, count: int) -> None:
     if chunk is None:
         raise TimeoutError(f"compiled in {compiling:.1f} s, and no time was left to train")
     starts = evaluation_starts() if count <= MANY_SEEDS else evaluation_starts(FEWER_STARTS)
-    flights = trainer.gather(fly(states.learner, inputs, starts))
+    flights = trainer.gather(without_records(trainer.fly)(states.learner, inputs, starts))
     success = [summarize(jax.tree.map(lambda x, i=i: x[i], flights))["success"] for i in range(count)]
     first = [seconds for seconds in flies_at if seconds is not None]
     report(

@@ -112,11 +112,12 @@ def newest_unroll(inputs: Inputs) -> Any:
 
 
 def act_policy(trainer: Trainer, call: Call) -> Any:
-    state, hyper = call.inputs.state.learner, call.inputs.member.hyper
+    spec, state = trainer.setup.spec, call.inputs.state.learner
     state = state._replace(params=perturb(state.params, call.tiny))
+    acting = learner.with_scale_in_weights(spec, call.inputs.member.hyper, state)
 
     def step(_: None, observation: chex.Array) -> Any:
-        return None, learner.act(trainer.setup.spec, hyper, state, (), observation)[1]
+        return None, learner.act(spec, *acting, (), observation)[1]
 
     return jax.lax.scan(step, None, newest_unroll(call.inputs)[0])[1]
 

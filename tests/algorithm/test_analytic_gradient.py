@@ -372,9 +372,8 @@ def test_skipped_updates_are_counted_and_twenty_in_a_row_are_a_fault() -> None:
 def test_a_run_whose_updates_are_skipped_on_and_on_is_at_fault() -> None:
     """The fault names the gradient; the rows before have the number of skipped ones."""
     trainer, inputs, states = at_apg(sharp=1.0)
-    programs = driver.Programs(
-        lambda: trainer.train, lambda: trainer.apg, lambda: driver.report_flights(trainer), trainer.gather
-    )
+    fly = driver.report_flights(trainer)
+    programs = driver.Programs(lambda: trainer.train, lambda: trainer.apg, lambda: fly, trainer.gather)
     config = MANY_UPDATES.learner
     made = list(driver.run_chunks(states, inputs, programs, config, driver.Clock(), lambda: False))
     rows = [row for chunk in made for row in chunk.rows]

@@ -12,10 +12,9 @@ import pytest
 from brax.envs.base import Env, State
 from pydantic import ValidationError
 
-import collecting
 import small_run
 from fault_injection import assert_same_leaves, leaves
-from qrl.algorithm import analytic_gradient, learner, networks, rollout
+from qrl.algorithm import analytic_gradient, learner, networks, replay_buffer, rollout
 from qrl.algorithm.adapter import adapt
 from qrl.algorithm.learner import LearnerSpec
 from qrl.algorithm.networks import GRU
@@ -139,23 +138,14 @@ def collected(spec: LearnerSpec, state: Any, unrolls: int) -> list[Any]:
     env, hyper = adapt(Hidden()), spec.config.hyperparameters
     memory = learner.initial_memory(spec, LANES)
     lanes = rollout.init(env, jax.random.PRNGKey(6), jnp.arange(LANES), LANES, 12, T, memory)
+    ring = replay_buffer.create(rollout.transitions_of(lanes, env.action_size, T), unrolls)
+    policy, sigma, starts = partial(learner.act, spec, hyper, state), jnp.float32(0.3), jax.random.PRNGKey(6)
     unroll = jax.jit(
-        lambda lanes, key: collecting.unroll(
-            env,
-            lanes,
-            partial(learner.act, spec, hyper, state),
-            jnp.float32(0.3),
-            key,
-            jax.random.PRNGKey(6),
-            unroll_length=T,
-            max_episode_steps=12,
-        )
+        lambda lanes, ring, key: rollout.unroll(env, lanes, ring, policy, sigma, key, starts, max_episode_steps=12)
     )
-    found = []
     for i in range(unrolls):
-        lanes, transitions = unroll(lanes, jax.random.PRNGKey(i))
-        found.append(transitions)
-    return found
+        lanes, ring = unroll(lanes, ring, jax.random.PRNGKey(i))
+    return [jax.tree.map(lambda x, i=i: x[i], ring.data) for i in range(unrolls)]
 
 
 def test_what_was_collected_is_replayed_with_its_memory() -> None:

@@ -26,13 +26,16 @@ indices = jax.jit(replay_buffer.sample, static_argnums=(2, 3))
 
 
 def plain_add(ring: ReplayBuffer, unroll: Any) -> ReplayBuffer:
-    """An unroll's lanes, the last first, each step by itself, as a rollout writes them."""
-    data, slot = ring.data, replay_buffer.slot(ring)
-    lanes, steps = jax.tree.leaves(unroll)[0].shape[:2]
-    for lane in reversed(range(lanes)):
-        for t in range(steps):
-            values = jax.tree.map(lambda x, lane=lane, t=t: jnp.asarray(x)[lane : lane + 1, t], unroll)
-            data = jax.tree.map(lambda d, x, lane=lane, t=t: replay_buffer.write(d, x, slot, lane, t), data, values)
+    """An unroll's lanes, the last first, each step by itself, and rewards all at once, as a rollout writes them."""
+    data, slot = dict(ring.data), replay_buffer.slot(ring)
+    for name, x in unroll.items():
+        for lane in reversed(range(len(x))):
+            values = jnp.asarray(x)[lane : lane + 1]
+            if name == "reward":
+                data[name] = replay_buffer.write(data[name], values, slot, lane)
+                continue
+            for t in range(x.shape[1]):
+                data[name] = replay_buffer.write(data[name], values[:, t], slot, lane, t)
     return ReplayBuffer(data, ring.inserted + 1)
 
 

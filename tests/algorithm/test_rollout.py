@@ -526,18 +526,40 @@ def test_lanes_are_stepped_alike_in_blocks(lanes: int, monkeypatch: pytest.Monke
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), in_blocks, at_once)
 
 
-def test_an_unroll_is_written_into_the_next_slot_alone() -> None:
-    """The others keep what they hold; so twice around the ring."""
+@pytest.mark.parametrize("block", [rollout.BLOCK_LANES, LANES // 2], ids=["one block", "two blocks"])
+def test_an_unroll_is_written_into_the_next_slot_alone(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others keep what they hold, twice around the ring; what is written is what a ring of one slot would hold."""
+    monkeypatch.setattr(rollout, "BLOCK_LANES", block)
     env, key, sigma = adapt(MARKED), jax.random.PRNGKey(4), jnp.float32(SIGMA)
     lanes = rollout.init(env, key, jnp.arange(LANES), LANES, LONGEST, T)
     ring = replay_buffer.create(rollout.transitions_of(lanes, env.action_size, T), 3)
     written = jax.jit(
         lambda lanes, ring, key: rollout.unroll(
-            env, lanes, ring, lambda memory, o: (memory, mean(o)), sigma, key, key, max_episode_steps=LONGEST
+            env,
+            lanes,
+            ring,
+            lambda memory, o: (memory, mean(o)),
+            sigma,
+            key,
+            jax.random.PRNGKey(4),
+            max_episode_steps=LONGEST,
+        )
+    )
+    alone = jax.jit(
+        lambda lanes, key: collecting.unroll(
+            env,
+            lanes,
+            lambda memory, o: (memory, mean(o)),
+            sigma,
+            key,
+            jax.random.PRNGKey(4),
+            unroll_length=T,
+            max_episode_steps=LONGEST,
         )
     )
     for i in range(6):
         before = ring
+        _, expected = alone(lanes, jax.random.PRNGKey(i))
         lanes, ring = written(lanes, ring, jax.random.PRNGKey(i))
         assert int(ring.inserted) == i + 1
         newest = replay_buffer.newest(ring)
@@ -546,7 +568,46 @@ def test_an_unroll_is_written_into_the_next_slot_alone() -> None:
                 continue
             np.testing.assert_array_equal(now[i % 3], new)
             np.testing.assert_array_equal(np.delete(now, i % 3, 0), np.delete(then, i % 3, 0))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6), newest, expected)
         assert np.abs(newest.observation).max(axis=-1).min() > 0
+
+
+class Whole(Env):
+    """Observations in whole numbers."""
+
+    observation_size, action_size, backend = 2, 1, "none"  # pyright: ignore[reportAssignmentType]
+
+    def reset(self, rng: jax.Array) -> State:
+        zero = jnp.float32(0.0)
+        return State(pipeline_state=None, obs=jnp.zeros(2, jnp.int32), reward=zero, done=zero)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        return state.replace(obs=state.obs + jnp.round(action[0]).astype(jnp.int32) + 1)
+
+
+@pytest.mark.parametrize("env", [MARKED, Whole(), worlds.make("hover")], ids=["float", "integer", "hover"])
+def test_what_is_recorded_has_the_types_of_a_step(env: Any) -> None:
+    """`transitions_of` says them without tracing one."""
+    env = adapt(env)
+    lanes = jax.eval_shape(lambda: rollout.init(env, jax.random.PRNGKey(0), jnp.arange(4), 4, 10, 5))
+    expected = rollout.transitions_of(lanes, env.action_size, 5)
+
+    def step(lanes: Lanes) -> Transition:
+        steps, none = rollout.Steps(env, lanes), jnp.zeros(4, bool)
+        packed = steps.pack(lanes)
+        now = rollout.UnrollCarry(packed, none, none, jnp.zeros_like(packed.state.observation))
+        policy = lambda memory, o: (memory, jnp.zeros((4, env.action_size)))  # noqa: E731
+        noise, key = jnp.ones((4, env.action_size)), jax.random.PRNGKey(0)
+        return rollout._step(steps, policy, jnp.float32(0.1), key, 10, lanes_last(lanes.state), now, noise)[1]
+
+    found = jax.eval_shape(step, lanes)
+    for name in (*rollout._wide(found), *rollout._narrow(found)):
+        ours, theirs = getattr(expected, name), getattr(found, name)
+        assert (ours.dtype, ours.shape) == (theirs.dtype, (4, 5, *theirs.shape[1:])), name
+    assert (expected.final_observation.dtype, expected.final_observation.shape) == (
+        found.observation.dtype,
+        (4, 2, env.observation_size),
+    )
 
 
 def test_rows_are_chosen_as_by_where() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from qrl import tasks
+from qrl.cli import main as cli
 from qrl.cli.arguments import parse
 from qrl.cli.main import RARE_COLLECTIONS, _note_former_names, limit_size, main
 from qrl.config import FORMER_NAMES, Config
@@ -15,15 +16,14 @@ from qrl.request import config_file
 from qrl_envs.specfile import BadInput
 
 
-def test_garbage_is_collected_rarely_in_a_command() -> None:
-    """But it is collected."""
-    before = gc.get_threshold()
-    try:
-        assert main(["tasks"]) == 0
-        assert gc.isenabled()
-        assert gc.get_threshold() == RARE_COLLECTIONS
-    finally:
-        gc.set_threshold(*before)
+@pytest.mark.parametrize("code", [0, 2])
+def test_garbage_is_collected_rarely_in_a_command(code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """And as before after it, whether it ends well or is told that its input is wrong."""
+    before, within = gc.get_threshold(), []
+    monkeypatch.setattr(cli, "configure_jax", lambda: within.append((gc.isenabled(), gc.get_threshold())))
+    assert main(["tasks"] if code == 0 else ["view", "no such run"]) == code
+    assert within == [(True, RARE_COLLECTIONS)]
+    assert gc.get_threshold() == before
 
 
 @pytest.mark.parametrize(("former", "name"), FORMER_NAMES.items())

@@ -14,6 +14,8 @@ from experiments.bench.process import OUT_OF_TIME, follow
 from experiments.gpu import run as gpu
 from experiments.gpu import sections, trace
 from qrl.config import Config, preset_names
+from qrl_envs import env as worlds
+from small_run import run_config
 
 CPU = [{"platform": "cpu", "kind": "cpu", "memory_bytes": None}]
 ABOUT = {"devices": "1 × abacus", "versions": {"qrl": "0"}}
@@ -173,6 +175,19 @@ def test_a_section_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert page.startswith("# qrl on 1 × cpu\n")
     assert "| plant | plant, real, 8 lanes | " in page
     assert page in capsys.readouterr().out
+
+
+def test_a_training_in_small(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two seeds of a little pendulum, from the first state to the flights of what is deployed."""
+    monkeypatch.setattr(sections, "run_of", lambda *_, **__: run_config(num_evals=2))
+    monkeypatch.setattr(sections.tasks, "environment", lambda _: worlds.make("pendulum"))
+    monkeypatch.setattr(sections, "evaluation_starts", lambda *_: jax.random.split(jax.random.PRNGKey(0), 6))
+    sizes = sections.Sizes((), (), (), (), ())
+    sections.attempt(sizes, "pendulum", sections.train, sizes, "pendulum", 2)
+    (row,) = [json.loads(line.removeprefix("BENCH ")) for line in capsys.readouterr().out.splitlines()]
+    assert "failed" not in row
+    assert (row["figure"], row["starts"], row["done"], row["faults"]) == ("pendulum_gpu, 2 seeds", 6, 1.0, [])
+    assert 0.0 <= row["success_mean"] <= 1.0
 
 
 def test_the_largest_sizes_come_first(monkeypatch: pytest.MonkeyPatch) -> None:

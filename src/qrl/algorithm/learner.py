@@ -138,10 +138,11 @@ def with_scale_in_weights(
     spec: LearnerSpec, hyper: Hyperparameters, state: LearnerState
 ) -> tuple[Hyperparameters, LearnerState]:
     """Hyperparameters and a state with which `act` does the same, to rounding, without multiplying each observation by
-    `observation_scale`: the policy's first layer has it in its weights. Unchanged where what the policy network is
-    given is another view of observations.
+    `observation_scale`: the policy's first layer has it in its weights. Unchanged where the policy network is given
+    another view of observations; and elsewhere than on a CPU, where products may round more than to float32, and so
+    differ from the learner's.
     """
-    if hyper.observation_scale is None:
+    if hyper.observation_scale is None or jax.default_backend() != "cpu":
         return hyper, state
     scale = hyper.observation_scale[: spec.policy_observation_size]
     if spec.policy_view(scale) is not scale:

@@ -30,12 +30,15 @@ def slot(buffer: ReplayBuffer) -> chex.Array:
 def write(
     data: chex.Array, values: chex.Array, slot: chex.Array, lane: chex.Array, step: chex.Array | None = None
 ) -> chex.Array:
-    """A leaf of `data` [slots, N, T, ...] with the values [n, ...] of n lanes, the first of which is `lane`, at a step;
-    without a step `values` are [n, T, ...], or of a leaf without time axis. In place, where nothing else needs it.
+    """A leaf of a buffer's data, in place where nothing else needs it, with the values of n lanes, from `lane` on.
+
+    Of a leaf [slots, N, T, ...]: values [n, ...] at `step`, or [n, T, ...] without a step. Of a leaf without time axis,
+    [slots, N, ...]: values [n, ...].
     """
     values = jnp.expand_dims(values, 0 if step is None else (0, 2)).astype(data.dtype)
-    first = [slot, lane, *([] if step is None else [step])]
-    return jax.lax.dynamic_update_slice(data, values, first + [0] * (data.ndim - len(first)))
+    at = [slot, lane, *([] if step is None else [step])]
+    first = [jnp.asarray(i, jnp.int32) for i in at + [0] * (data.ndim - len(at))]
+    return jax.lax.dynamic_update_slice(data, values, first)
 
 
 def newest(buffer: ReplayBuffer) -> chex.ArrayTree:

@@ -22,7 +22,8 @@ from qrl.algorithm.types import State, TaskEnv, Transition, info_flag
 from qrl_envs.fusion import stored
 
 TRUNCATIONS = "truncated", "truncation", "out_of_bounds"  # of an environment's `info`
-WIDE, UNTIMED = ("observation", "action"), ("final_observation", "memory")  # fields of a `Transition`
+# Fields of a `Transition`: with a vector a lane and step, and without time axis; the others have a number.
+WIDE, UNTIMED = ("observation", "action"), ("final_observation", "memory")
 BLOCK_LANES = 512  # most lanes stepped at a time on a CPU: with more, what passes between steps leaves its cache
 
 
@@ -150,13 +151,18 @@ class Steps:
 def _chosen(chosen: chex.Array, carry: Carry, other: Carry) -> Carry:
     """`carry` in the lanes `chosen` [n], else `other`."""
     observation = _chosen_rows(chosen[:, None], carry.observation, other.observation)
-    return jax.tree.map(jnp.where, carry.each(chosen), carry, other)._replace(observation=observation)
+    rest = jax.tree.map(
+        lambda x, y: jnp.where(chosen, x, y), carry._replace(observation=()), other._replace(observation=())
+    )
+    return rest._replace(observation=observation)
 
 
 def _chosen_rows(chosen: chex.Array, x: chex.Array, other: chex.Array) -> chex.Array:
-    """`x` [n, F] where `chosen` [n, 1], else `other`, by their bits: of a selection along so short an axis LLVM makes a
-    load from one of two places for each number, not of several at a time.
+    """`x` [n, F] where `chosen` [n, 1], else `other`; floats by their bits, since LLVM compiles a selection over so
+    short a row to a load for each number.
     """
+    if not jnp.issubdtype(x.dtype, jnp.floating):
+        return jnp.where(chosen, x, other)
     unsigned = jnp.dtype(f"uint{8 * x.dtype.itemsize}")
     mask = jnp.where(chosen, ~unsigned.type(0), unsigned.type(0))
     bits, others = (jax.lax.bitcast_convert_type(each, unsigned) for each in (x, other))
@@ -289,14 +295,12 @@ def unroll(
 
 
 def _wide(transition: Transition) -> Any:
-    """The part that is written at each step, [n, ...]."""
+    """The vectors [n, ...], which are written at each step."""
     return {name: getattr(transition, name) for name in WIDE}
 
 
 def _narrow(transition: Transition) -> Any:
-    """The part with one number a lane and step, which is written at the end, [T, n] transposed: by itself each would
-    take a line of the cache.
-    """
+    """The numbers [n], which are written after the last step: each would take a line of the cache by itself."""
     return {name: x for name, x in transition._asdict().items() if name not in (*WIDE, *UNTIMED)}
 
 

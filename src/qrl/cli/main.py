@@ -18,7 +18,9 @@ from qrl.config import FORMER_NAMES
 from qrl_envs.specfile import BadInput, read
 
 CACHE_BYTES = 2_000_000_000  # of compiled programs
-RARE_COLLECTIONS = 200_000, 20, 20  # objects made between two collections of garbage, and how many of each kind a next
+# Of garbage, as `gc.set_threshold` has it: objects made between two collections of the young, of these between two of
+# the middle generation, and of those between two of all.
+RARE_COLLECTIONS = 200_000, 20, 2
 
 
 def configure_jax() -> None:
@@ -53,8 +55,16 @@ def limit_size(folder: Path, most_bytes: int) -> None:
 def main(argv: list[str] | None = None) -> int:
     """Run one command; returns the exit code: 0 done, 1 failed while running, 2 the input was wrong."""
     keep_interrupts()
+    before = gc.get_threshold()
     # Imports and tracing make much and drop little, and Python would go through all of it again and again.
     gc.set_threshold(*RARE_COLLECTIONS)
+    try:
+        return _main(argv)
+    finally:
+        gc.set_threshold(*before)
+
+
+def _main(argv: list[str] | None) -> int:
     args = parse(argv)
     subject = {"train": "task", "sweep": "grid", "identify": "vehicle"}.get(args.command, "run")
     if args.command != "tasks":
