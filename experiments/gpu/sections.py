@@ -41,7 +41,9 @@ FEWER_STARTS = 100  # of each seed, where there are more than a few
 MANY_SEEDS = 16
 RESERVED_SECONDS = 12.0  # of a section's time, for what comes after training
 CACHE_HIT = "/jax/compilation_cache/cache_hits"
-COPIES = 3  # of an unroll in memory: in the replay buffer, what a step's numbers are turned from, and one to spare
+COPIES = (
+    3  # of an unroll in memory: in the replay buffer, numbers of each step before they are transposed, one to spare
+)
 
 
 class Sizes(NamedTuple):
