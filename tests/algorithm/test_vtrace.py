@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from qrl.algorithm.vtrace import Trace, vtrace
+from qrl.algorithm.vtrace import Trace, linear_recurrence, vtrace
 
 with warnings.catch_warnings():
     # rlax imports TensorFlow Probability, which reads a name that JAX has retired.
@@ -196,6 +196,24 @@ def test_trace_does_not_leak_over_an_end(flag: str) -> None:
         np.testing.assert_array_equal(before[: end + 1], changed[: end + 1])
         assert (before[end + 1 :] != changed[end + 1 :]).all()
     assert (ours(steps).v_trace[: end + 1] != ours(swapped(steps)).v_trace[: end + 1]).any()
+
+
+@pytest.mark.parametrize("steps", [1, 2, 3, 31, 32, 33, 64])
+def test_each_number_of_steps(steps: int) -> None:
+    """x_i = b_i + a_i·x_{i+1} by a loop, whatever the number of steps."""
+    a, b = np.random.default_rng(steps).uniform(0.0, 1.5, size=(2, steps))
+    expected, x = np.zeros(steps), 0.0
+    for i in reversed(range(steps)):
+        expected[i] = x = b[i] + a[i] * x
+    np.testing.assert_allclose(linear_recurrence(jnp.asarray(a), jnp.asarray(b)), expected, rtol=1e-12)
+
+
+def test_a_product_of_ratios_may_overflow() -> None:
+    """Importance ratios without clips, whose product is beyond float32, change nothing where every error is zero."""
+    zeros, big = np.zeros(T, np.float32), np.float32(1e30)
+    steps = Trajectory(zeros, zeros, zeros, zeros, zeros, np.full(T, big))
+    for output in ours(steps, rho_bar=big, c_bar=big):
+        np.testing.assert_array_equal(output, zeros)
 
 
 @pytest.mark.parametrize(("flag", "share"), [("terminated", 0.0), ("truncated", GAMMA)])

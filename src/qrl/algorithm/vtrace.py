@@ -3,8 +3,9 @@
 from typing import NamedTuple
 
 import chex
-import jax
 import jax.numpy as jnp
+
+from qrl_envs.fusion import stored
 
 
 class Trace(NamedTuple):
@@ -46,11 +47,22 @@ def vtrace(
     delta = reward + gamma * (1.0 - terminated) * next_value - value
     carry_on = gamma * lam * (1.0 - terminated) * (1.0 - truncated)
 
-    def backward(error: chex.Array, x: tuple[chex.Array, ...]) -> tuple[chex.Array, tuple[chex.Array, chex.Array]]:
-        delta_i, carry_on_i, rho_i = x
-        a_trace_i = delta_i + carry_on_i * error
-        error = jnp.minimum(rho_bar, rho_i) * delta_i + jnp.minimum(c_bar, rho_i) * carry_on_i * error
-        return error, (a_trace_i, error)
-
-    _, (a_trace, error) = jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, carry_on, rho), reverse=True)
+    error = linear_recurrence(jnp.minimum(c_bar, rho) * carry_on, jnp.minimum(rho_bar, rho) * delta)
+    a_trace = delta + carry_on * jnp.append(error[1:], jnp.zeros_like(error[:1]))
     return Trace(a_trace, value + error)
+
+
+def linear_recurrence(a: chex.Array, b: chex.Array) -> chex.Array:
+    """x_i = b_i + a_i·x_{i+1} for i from T − 1 down to 0, with x_T = 0; a ≥ 0 [T] and b [T] -> x [T].
+
+    By doubling (Hillis and Steele 1986): round k gives each x_i in terms of x_{i + 2^k}, so that six rounds do for 50
+    steps; a loop over the steps would be 50 launches on a GPU.
+    """
+    most = jnp.finfo(a.dtype).max  # a product that overflows stays a number: after an end it is multiplied by 0
+    steps, reach = len(b), 1
+    while reach < steps:
+        b = jnp.concatenate([b[:-reach] + a[: steps - reach] * b[reach:], b[-reach:]])
+        a = jnp.minimum(a[:-reach] * a[reach:], most)  # of those that more than `reach` steps follow
+        a, b = stored((a, b))
+        reach *= 2
+    return b
