@@ -28,7 +28,8 @@ class VehicleDistribution(Spec):
     fall_per_rise: Factor = (0.8, 2.0)  # uniform
     thrust_curve: Curve = (-0.15, 0.4)  # uniform
     drag_1_s: Range = (0.0, 0.7)  # uniform; linear drag over mass
-    force_surplus: NonNegative = 0.3  # constant force at most, of the thrust beyond the weight up to half of that
+    # Constant force at most, of the thrust beyond the weight, of which no more than 1.5 weights count.
+    force_surplus: NonNegative = 0.3
     moment_z_factor: Positive = 1.7  # moment of inertia about z over that about x
 
     @model_validator(mode="after")
@@ -36,6 +37,8 @@ class VehicleDistribution(Spec):
         if self.thrust_per_weight[0] < LEAST_THRUST_PER_WEIGHT:
             least, found = LEAST_THRUST_PER_WEIGHT, self.thrust_per_weight[0]
             raise ValueError(f"expected a thrust_per_weight of at least {least:g}, found {found:g}")
+        if not -0.9 <= self.thrust_curve[0] <= self.thrust_curve[1] <= 1.0:
+            raise ValueError(f"expected a thrust_curve from -0.9 to 1, found {list(self.thrust_curve)}")
         if self.moment_z_factor > 1.0 + 1.0 / self.pitch_factor[1]:
             raise ValueError(
                 "expected a moment_z_factor of at most 1 + 1/pitch_factor, as of a rigid body, found"

@@ -81,14 +81,16 @@ def actions(task: Task) -> list[ActionPort]:
                 frame="rotor speed, of its greatest; safe: that of the vehicle of the task's file in hover",
                 offset=0.5,
                 scale=0.5,
-                low=0.0,
+                low=round(float(least), 4),
                 high=1.0,
                 safe=round(float(speed), 4),
                 position_m=motor.position_m,
                 spin=motor.spin,
                 quantity="rotor speed fraction",
             )
-            for i, (motor, speed) in enumerate(zip(vehicle.motors, vehicle.hover_speeds, strict=True), 1)
+            for i, (motor, speed, least) in enumerate(
+                zip(vehicle.motors, vehicle.hover_speeds, vehicle.least_speeds, strict=True), 1
+            )
         ]
     hover = [float(thrust) for thrust in vehicle.hover_thrusts_N]
     return [

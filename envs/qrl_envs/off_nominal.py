@@ -73,7 +73,7 @@ def conditions(task: QuadrotorTask) -> dict[str, Condition]:
         "gusts": Condition(f"gusts of 1 m/s (1 σ, each axis, 1 s), {gusts_blow}", _fixed(**GUSTS)),
         "bias": Condition("the position measured 2 cm off, in any direction", _fixed(position_bias_m=BIAS_M)),
         "estimator": Condition(fixes, _fixed(**FIXES)),
-        "half_rate": Condition("the policy at half of its rate", held_periods=2),
+        "half_rate": Condition("each action held for two periods", held_periods=2),
         "noise": Condition("sensors err by 1 cm, 2 cm/s, 0.01 rad, 0.02 rad/s (1 σ, each axis)", _fixed(**NOISE)),
         "together": Condition(
             f"latency of 10 ms, noise, mass 20 % above, {blows}",
@@ -86,7 +86,7 @@ def conditions(task: QuadrotorTask) -> dict[str, Condition]:
 
 
 class OffNominalParams(NamedTuple):
-    """`env.RealParams` and the start, so that one compiled program serves all conditions."""
+    """The parameters of a `RealQuadrotorEnv` and the start, so that one compiled program serves all conditions."""
 
     physics: Any
     reward: Any

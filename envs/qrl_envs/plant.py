@@ -4,6 +4,7 @@ A `World` is one flight's draw of an `Uncertainty`; it is constant during the fl
 flight; the caller vmaps.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import chex
@@ -301,7 +302,7 @@ def advance(
         now = speed_at(jnp.float32(time_s)) if time_s else speed
         return stored(world.motor_factor * physics.motor_max_N * rotors.thrust_fraction(world.rotors.curve, now))
 
-    substeps = max(1, round(dt_s / INTEGRATION_STEP_S))
+    substeps = math.ceil(dt_s / INTEGRATION_STEP_S - 1e-6)
     short_s = dt_s / substeps
     for i in range(substeps):
         begin_s, middle_s = i * short_s, (i + 0.5) * short_s

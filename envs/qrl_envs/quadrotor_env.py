@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from qrl_envs import measures, own_vehicle, plant, quadrotor, rewards, symmetry
-from qrl_envs.reference import Random, Reference
+from qrl_envs.reference import Reference
 from qrl_envs.symmetry import Symmetry
-from qrl_envs.target import Figure, Motion, Target
+from qrl_envs.target import Figure, Lap, Motion, Target, follow
 from qrl_envs.task import QuadrotorTask
 from qrl_envs.task_env import Evaluation, Params, State, TaskEnv
 from qrl_envs.uncertainty import Uncertainty
@@ -129,20 +129,16 @@ class RealQuadrotorEnv(QuadrotorEnv):
         uncertainty = uncertainty or task.uncertainty or Uncertainty()
         self.params = self.params._replace(ranges=plant.ranges(uncertainty, task.vehicle))
         self._integrator = plant.integrator(task)
-        self._reference = self._followed(task.reference, task.episode_s, anywhere=True)
+        self._reference = self._followed(task.reference, anywhere=True)
         self._calibrating = False
         parts = observed(task)
         self.policy_observation_size = sum(parts[:-1])
         self._sizes = sum(parts), len(task.vehicle.motors)
         self._layout = (shaped_for or uncertainty).layout(task.control_period_s)
 
-    def _followed(self, spec: Reference | None, flight_s: float, anywhere: bool) -> Figure | Motion | None:
-        """The reference that `spec` describes; of a figure that repeats, flights may begin anywhere."""
-        if spec is None:
-            return None
-        if isinstance(spec, Random):
-            return Motion(spec, self.task.control_period_s, self.task.preview_s)
-        return Figure(spec, self.task.control_period_s, flight_s, self.task.preview_s, anywhere)
+    def _followed(self, spec: Reference | None, anywhere: bool) -> Figure | Lap | Motion | None:
+        """The reference that `spec` describes, in flight; on one that is known, flights may begin anywhere."""
+        return None if spec is None else follow(spec, self.task.control_period_s, self.task.preview_s, anywhere)
 
     def _target(self, world: plant.World, steps: chex.Array) -> Target | None:
         return self._reference.at(world.reference, steps) if self._reference else None
@@ -226,7 +222,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
     def evaluation(self) -> Evaluation:
         plan, spec = super().evaluation(), self.task.evaluation
         if isinstance(env := plan.env, RealQuadrotorEnv) and not self._calibrating:
-            env._reference = self._followed(spec.reference, spec.duration_s, anywhere=False)
+            env._reference = self._followed(spec.reference, anywhere=False)
         return plan
 
     def calibrating(self) -> "RealQuadrotorEnv":

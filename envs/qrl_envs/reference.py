@@ -58,7 +58,29 @@ class Point(Base):
         return Kinematics(zero + self.position_m, zero, zero)
 
 
-class Lissajous(Base):
+class Sine(NamedTuple):
+    """center + amplitude·sin(rate·t + phase) along each axis; float64 [3] each."""
+
+    center_m: np.ndarray
+    amplitude_m: np.ndarray
+    rate_rad_s: np.ndarray
+    phase_rad: np.ndarray
+
+
+class Lap(Base):
+    """What repeats: a sine along each axis."""
+
+    @property
+    def sine(self) -> Sine:
+        raise NotImplementedError
+
+    def at(self, times_s: np.ndarray) -> Kinematics:
+        center, size, rate, phase = self.sine
+        angle = rate * np.asarray(times_s)[:, None] + phase
+        return Kinematics(center + size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
+
+
+class Lissajous(Lap):
     """center + amplitude_m·sin(2π·cycles·t/period_s + phase_rad) along each axis.
 
     A figure-eight has the cycles 1, 2, 0; a circle 1, 1, 0 and a phase of π/2 along x.
@@ -85,14 +107,13 @@ class Lissajous(Base):
     def lap_s(self) -> float | None:
         return self.period_s
 
-    def at(self, times_s: np.ndarray) -> Kinematics:
+    @property
+    def sine(self) -> Sine:
         rate = 2.0 * np.pi * np.array(self.cycles) / self.period_s
-        angle, size = rate * np.asarray(times_s)[:, None] + self.phase_rad, np.array(self.amplitude_m)
-        position = np.array(self.center_m) + size * np.sin(angle)
-        return Kinematics(position, size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
+        return Sine(np.array(self.center_m), np.array(self.amplitude_m), rate, np.array(self.phase_rad))
 
 
-class Circle(Base):
+class Circle(Lap):
     """A horizontal circle about center_m; a speed above 0 is counter-clockwise seen from above."""
 
     form: Literal["circle"]
@@ -110,12 +131,10 @@ class Circle(Base):
     def lap_s(self) -> float | None:
         return 2.0 * np.pi * self.radius_m / abs(self.speed_m_s)
 
-    def at(self, times_s: np.ndarray) -> Kinematics:
-        rate = self.speed_m_s / self.radius_m
-        angle = rate * np.asarray(times_s)
-        outward = self.radius_m * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-        along = self.speed_m_s * np.stack([-np.sin(angle), np.cos(angle), 0.0 * angle], axis=1)
-        return Kinematics(outward + self.center_m, along, -(rate**2) * outward)
+    @property
+    def sine(self) -> Sine:
+        size, quarter = np.array([self.radius_m, self.radius_m, 0.0]), np.array([np.pi / 2.0, 0.0, 0.0])
+        return Sine(np.array(self.center_m), size, np.full(3, self.speed_m_s / self.radius_m), quarter)
 
 
 class Waypoints(Base):

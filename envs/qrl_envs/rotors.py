@@ -40,10 +40,13 @@ def speed_of(curve: chex.Array, fraction: chex.Array) -> chex.Array:
 
 
 def after(parameters: Rotors, speed: chex.Array, set_point: chex.Array, time_s: chex.Array) -> chex.Array:
-    """Speeds after `time_s` [] at a constant set-point; [N], [N] -> [N]. A time constant of 0 follows at once."""
+    """Speeds after `time_s` [] at a constant set-point; [N], [N] -> [N]. With a time constant of 0 they follow at once,
+    but not before any time has passed.
+    """
 
     def left_of(lag_s: chex.Array) -> chex.Array:  # not of each rotor: constant during a flight
-        return jnp.where(lag_s > TINY, jnp.exp(-time_s / jnp.maximum(lag_s, TINY)), 0.0)
+        at_once = jnp.where(time_s > 0.0, 0.0, 1.0)
+        return jnp.where(lag_s > TINY, jnp.exp(-time_s / jnp.maximum(lag_s, TINY)), at_once)
 
     left = jnp.where(set_point > speed, left_of(parameters.rise_s), left_of(parameters.fall_s))
     return set_point + (speed - set_point) * left

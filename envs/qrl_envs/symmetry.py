@@ -81,7 +81,8 @@ def _motor_permutation(physics: Physics, body: chex.Array) -> tuple[chex.Array, 
     bijective = jnp.all(motors.sum(axis=0) == 1.0) & jnp.all(motors.sum(axis=1) == 1.0)
     inertia = physics.inertia_kg_m2
     matrix = jnp.diag(inertia) if inertia.ndim == 1 else inertia
-    turned = jnp.sum((body @ matrix)[:, None] * body[None], axis=-1)
+    half = jnp.sum(body[:, :, None] * matrix[None], axis=1)
+    turned = jnp.sum(half[:, None] * body[None], axis=-1)
     return motors, bijective & jnp.all(jnp.abs(turned - matrix) <= SAME_INERTIA * jnp.max(matrix))
 
 

@@ -2,7 +2,7 @@
 ahead: the reference's velocity then minus its velocity now. For one flight; the caller vmaps, or lets flights lie along
 trailing axes.
 
-A `Figure` is known beforehand; `Motion` is drawn for each flight.
+`Figure` and `Lap` are known beforehand; `Motion` is drawn for each flight.
 """
 
 from collections.abc import Sequence
@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from qrl_envs import reference
 from qrl_envs.quadrotor import Physics
-from qrl_envs.reference import VERTICAL, Fixed, Random
+from qrl_envs.reference import VERTICAL, Fixed, Random, Reference
 
 
 class Target(NamedTuple):
@@ -25,22 +26,30 @@ class Target(NamedTuple):
     preview_m_s: chex.Array  # [3k] for k times ahead
 
 
-class Figure:
-    """A fixed reference in compiled code: a table of its steps. A flight begins at its own place."""
+class Known:
+    """A reference known beforehand. A flight begins at a place of its own on it, or all of them at its beginning."""
 
     draws = 1
 
-    def __init__(self, spec: Fixed, dt_s: float, flight_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
-        self._begins = round((spec.lap_s or spec.duration_s or 0.0) / dt_s) if anywhere else 0
-        self._ahead = [round(time_s / dt_s) for time_s in ahead_s]
-        steps = round(flight_s / dt_s) + self._begins + max(self._ahead, default=0) + 2
-        found = spec.at(np.arange(steps) * dt_s)
-        self._table = np.concatenate([found.position_m, found.velocity_m_s], axis=1).astype(np.float32)
+    def __init__(self, lasts_s: float, dt_s: float) -> None:
+        """Flights begin anywhere in its first `lasts_s`."""
+        self._begins, self._dt_s = round(lasts_s / dt_s), dt_s
 
     def draw(self, u: chex.Array, physics: Physics, thrust: chex.Array) -> Any:
-        """Where on the figure a flight begins, from u [1] uniform in [0, 1); int32 []."""
+        """At which of its steps a flight begins, from u [1] uniform in [0, 1); int32 []."""
         del physics, thrust
         return jnp.floor(u[0] * self._begins).astype(jnp.int32)
+
+
+class Figure(Known):
+    """One that ends, as a table of its steps; then it stays where it is."""
+
+    def __init__(self, spec: Fixed, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
+        lasts_s = spec.duration_s or 0.0
+        super().__init__(lasts_s if anywhere else 0.0, dt_s)
+        self._ahead = [round(time_s / dt_s) for time_s in ahead_s]
+        found = spec.at(np.arange(round(lasts_s / dt_s) + 2) * dt_s)
+        self._table = np.concatenate([found.position_m, found.velocity_m_s], axis=1).astype(np.float32)
 
     def at(self, begin: Any, steps: chex.Array) -> Target:
         """The target of a flight that has made `steps` [...] and began at `begin` [...]."""
@@ -52,6 +61,27 @@ class Figure:
         now = row(0)
         preview = [row(ahead)[3:] - now[3:] for ahead in self._ahead]
         return Target(now[:3], now[3:], jnp.concatenate(preview) if preview else now[:0])
+
+
+class Lap(Known):
+    """One that repeats, in closed form: for as long as a flight is."""
+
+    def __init__(self, spec: reference.Lap, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
+        super().__init__((spec.lap_s or 0.0) if anywhere else 0.0, dt_s)
+        self._sine, self._ahead_s = spec.sine, [round(time_s / dt_s) * dt_s for time_s in ahead_s]
+
+    def at(self, begin: Any, steps: chex.Array) -> Target:
+        """As `Figure.at`."""
+        time_s = jnp.asarray(begin + steps) * self._dt_s
+        along = [jnp.asarray(x, jnp.float32).reshape(3, *[1] * time_s.ndim) for x in self._sine]
+        center, size, rate, phase = along
+        angle = rate * time_s + phase
+        sine, cosine, speed = jnp.sin(angle), jnp.cos(angle), size * rate
+        preview = []
+        for later_s in self._ahead_s:  # by the sum of angles, as in `Motion.at`
+            later = cosine * jnp.cos(rate * later_s) - sine * jnp.sin(rate * later_s)
+            preview.append(speed * (later - cosine))
+        return Target(center + size * sine, speed * cosine, jnp.concatenate(preview) if preview else sine[:0])
 
 
 class Sines(NamedTuple):
@@ -100,3 +130,13 @@ class Motion:
             later = cosine * turned[0] - sine * turned[1]
             preview.append(jnp.sum(speed * later, axis=1) - velocity)
         return Target(jnp.sum(size * sine, axis=1), velocity, jnp.concatenate(preview) if preview else velocity[:0])
+
+
+def follow(spec: Reference, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> Figure | Lap | Motion:
+    """A reference in flight, at steps of `dt_s` and with a preview of the times `ahead_s`; flights may begin `anywhere`
+    on one that is known.
+    """
+    if isinstance(spec, Random):
+        return Motion(spec, dt_s, ahead_s)
+    kind = Lap if isinstance(spec, reference.Lap) else Figure
+    return kind(spec, dt_s, ahead_s, anywhere)  # pyright: ignore[reportArgumentType]

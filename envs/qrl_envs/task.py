@@ -207,6 +207,13 @@ class QuadrotorTask(Spec):
                     f"expected bounds.distance_m beyond the starts, which reach {reach:.3g} m ({where}.position_m ="
                     f" {start.position_m:g} along each axis), found {self.bounds.distance_m:g}"
                 )
+            fastest = 3**0.5 * start.body_rate_rad_s
+            if fastest >= self.bounds.body_rate_rad_s:
+                raise ValueError(
+                    f"expected bounds.body_rate_rad_s beyond the starts, which reach {fastest:.3g} rad/s"
+                    f" ({where}.body_rate_rad_s = {start.body_rate_rad_s:g} about each axis), found"
+                    f" {self.bounds.body_rate_rad_s:g}"
+                )
         return _periods_fit(self)
 
     def _check_distribution(self) -> None:
@@ -463,11 +470,15 @@ def _lags(vehicle: Any) -> bool:
     return bool(vehicle.get("rotor_rise_s")) or (isinstance(drag, list) and any(drag))
 
 
-def _without(lagged: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
-    """`lagged` without what a file that extends the task gives itself; of a reward, weight by weight."""
+def _without(lagged: dict[str, Any], given: dict[str, Any], form: str | None) -> dict[str, Any]:
+    """`lagged` without what a file that extends the task gives itself; of a reward of the task's `form`, weight by
+    weight.
+    """
     left = {key: value for key, value in lagged.items() if key not in given or key == "reward"}
     if isinstance(reward := given.get("reward"), dict) and "reward" in left:
-        left["reward"] = {key: value for key, value in left["reward"].items() if key not in reward}
+        own = {key: value for key, value in left.pop("reward").items() if key not in reward}
+        if reward.get("form") in (None, form):
+            left["reward"] = own
     return left
 
 
@@ -482,5 +493,6 @@ def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
     given = {key: value for key, value in data.items() if key != "extend"}
     if not isinstance(given.get(LAGGED, {}), dict):
         raise BadInput(f"{where}: key '{LAGGED}': expected an object")
-    lagged = specfile.merge(_without(shipped_base.get(LAGGED, {}), given), given.get(LAGGED, {}))
+    form = shipped_base["reward"].get("form") if "reward" in shipped_base else None
+    lagged = specfile.merge(_without(shipped_base.get(LAGGED, {}), given, form), given.get(LAGGED, {}))
     return specfile.merge(shipped_base, given) | {LAGGED: lagged}

@@ -37,7 +37,8 @@ class Uncertainty(Spec):
     rotor_lag_s: Range | None = None  # in place of the vehicle's time constants, rise and fall alike
     drag_factor: Range = ONE
     force_weights: Range = ZERO  # constant force in any direction, of the vehicle's weight
-    torque_share: Range = ZERO  # constant torque about any axis, of the greatest about x or y from hover
+    # Constant torque about any axis, of what half of the motors have about x or y with their hover thrusts.
+    torque_share: Range = ZERO
     wind_m_s: Range = ZERO  # constant, horizontal; acts through drag
     # Standard deviation along world x and y of wind that changes, and its correlation time (`gusts`).
     gust_m_s: Range = later(ZERO)

@@ -16,6 +16,7 @@ LEAST_YAW_ACCELERATION_RAD_S2 = 0.3
 RECOVERY_M = 2.0
 LEAST_AXIS = 1e-3  # length
 MOST_SCALE_PER_THRUST = 2.0  # action_scale_N per greatest thrust of a motor, above which actions hardly grade thrusts
+LEAST_HOVER_SHARE = 0.2  # of the thrust of the motor that carries most in hover, below which a file is likely wrong
 LEAST_THRUST_PER_WEIGHT = 1.3  # below, a vehicle can only just hover
 
 
@@ -105,7 +106,7 @@ class Vehicle(Spec):
         torque = np.abs(self.torques_m @ hover).max()
         if abs(force - weight) > 1e-6 * weight or torque > 1e-6 * weight * arm or hover.min() < 0.0:
             raise ValueError(
-                "expected motors around the center of mass: hover would take"
+                "expected motors around the center of mass, and spins that balance: hover would take"
                 f" {', '.join(f'{f:.3g}' for f in hover)} N, and no motor can pull down"
             )
         over = [i for i, motor in enumerate(self.motors) if hover[i] > motor.max_N]
@@ -188,9 +189,19 @@ class Vehicle(Spec):
 
     @property
     def hover_speeds(self) -> np.ndarray:
-        """The rotors' speeds in hover, of their greatest: w with c·w + (1 − c)·w² = thrust/max; [motors], float64."""
-        share, c = self.hover_thrusts_N / [motor.max_N for motor in self.motors], self.thrust_curve
-        return 2.0 * share / (c + np.sqrt(c * c + 4.0 * (1.0 - c) * share))
+        """The rotors' speeds in hover, of their greatest; [motors], float64."""
+        return self._speeds(self.hover_thrusts_N)
+
+    @property
+    def least_speeds(self) -> np.ndarray:
+        """The rotors' speeds at `min_N`, of their greatest; [motors], float64."""
+        return self._speeds(np.array([motor.min_N for motor in self.motors]))
+
+    def _speeds(self, thrusts_N: np.ndarray) -> np.ndarray:
+        """w with c·w + (1 − c)·w² = thrust/max, and 0 without thrust."""
+        share, c = thrusts_N / [motor.max_N for motor in self.motors], self.thrust_curve
+        some = np.maximum(share, 1e-12)
+        return np.where(share > 0.0, 2.0 * some / (c + np.sqrt(c * c + 4.0 * (1.0 - c) * some)), 0.0)
 
     @property
     def angular_acceleration_rad_s2(self) -> np.ndarray:
@@ -222,6 +233,18 @@ class Vehicle(Spec):
             found.append("its motors cannot turn it about all axes independently: check motors.spin")
         if (yaw := self.angular_acceleration_rad_s2[2]) < LEAST_YAW_ACCELERATION_RAD_S2:
             found.append(f"it can hardly turn about body z ({yaw:.2g} rad/s²): check yaw_moment_m, N m per N of thrust")
+        hover, most_N = self.hover_thrusts_N, [motor.max_N for motor in self.motors]
+        if hover.min() < LEAST_HOVER_SHARE * hover.max():
+            found.append(
+                f"in hover motor {hover.argmin() + 1} carries {hover.min():.2g} N and motor {hover.argmax() + 1}"
+                f" {hover.max():.2g} N: check motors.position_m and motors.spin"
+            )
+        reach = np.minimum(hover + self.action_scale_N, most_N).sum() / (self.mass_kg * STANDARD_GRAVITY_M_S2)
+        if reach < LEAST_THRUST_PER_WEIGHT <= ratio:
+            found.append(
+                f"actions reach {reach:.2f} of the weight, and its motors {ratio:.2f}: check action_scale_N"
+                f" ({self.action_scale_N:g} N); a file that extends a task has its vehicle's unless it gives one"
+            )
         if self.action_scale_N > MOST_SCALE_PER_THRUST * (most := max(motor.max_N for motor in self.motors)):
             found.append(
                 f"action_scale_N is {self.action_scale_N:g} N and no motor has more than {most:g} N, so nearly every"
@@ -231,7 +254,9 @@ class Vehicle(Spec):
 
 
 def with_default_scale(data: Any) -> Any:
-    """A vehicle object with `action_scale_N`: by default from hover thrust to the farther of a motor's limits."""
+    """A vehicle object with `action_scale_N`: by default from a quarter of the weight (of four motors) to the farther
+    of a motor's limits.
+    """
     if not isinstance(data, dict) or data.get("action_scale_N") is not None:
         return data
     try:
@@ -252,4 +277,6 @@ def vehicle_data(name_or_path: str) -> dict[str, Any]:
     A `.json` that holds a task is read for its key 'vehicle'.
     """
     data = specfile.named("vehicle", "vehicles", name_or_path)
-    return data["vehicle"] if isinstance(data.get("vehicle"), dict) else data
+    if isinstance(of_task := data.get("vehicle"), str):
+        return specfile.named("vehicle", "vehicles", of_task)
+    return of_task if isinstance(of_task, dict) else data

@@ -102,7 +102,7 @@ def acting_parts(trainer: Trainer, inputs: Inputs) -> list[Part]:
 def act(trainer: Trainer, call: Call) -> Any:
     lanes, buffer = call.last
     state, key = call.inputs.state, jax.random.fold_in(call.inputs.state.key, call.i)
-    return collect(trainer.setup, call.inputs.member.hyper, state.learner, lanes, buffer, key, state.start_key)
+    return collect(trainer.setup, call.inputs.member, state.learner, lanes, buffer, key, state.start_key)
 
 
 def newest_unroll(inputs: Inputs) -> Any:

@@ -76,7 +76,7 @@ def acting(
         def unroll(i: Any, carry: Any) -> Any:
             lanes, buffer = carry
             noise_key = jax.random.fold_in(key, i)
-            return collect(trainer.setup, inputs.hyper, learner, lanes, buffer, noise_key, start_key)
+            return collect(trainer.setup, inputs, learner, lanes, buffer, noise_key, start_key)
 
         return jax.tree.map(lambda x: x[None], jax.lax.fori_loop(0, unrolls, unroll, one))
 

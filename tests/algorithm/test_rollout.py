@@ -451,15 +451,35 @@ def test_the_key_decides_everything() -> None:
     assert (np.asarray(first[1].action) != other[1].action).all()
 
 
-def test_members_side_by_side_fly_as_they_would_alone() -> None:
-    """vmapped, a loop is passed for all where one needs it, and selects: nothing else may change."""
-    lanes = [begin(MARKED, seed) for seed in (4, 5)]
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+def test_members_side_by_side_fly_as_they_would_alone(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """vmapped, starts are drawn for all members where one needs them, which must not change any member's; and by the
+    operations that are chosen for a GPU, where the condition on them must remain one.
+    """
+    begun, unrolls = [begin(MARKED, seed) for seed in (4, 5)], 3
     keys = jax.random.split(jax.random.key(6), 2)
-    together = jax.jit(jax.vmap(unroll_of(MARKED)))(jax.tree.map(lambda *x: jnp.stack(x), *lanes), keys, keys)
-    for member in (0, 1):
-        alone = unroll_of(MARKED)(lanes[member], keys[member], keys[member])
-        for ours, expected in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
-            np.testing.assert_allclose(ours[member], expected, rtol=1e-5, atol=1e-5)
+    noise = [jax.random.split(key, unrolls) for key in keys]
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    program = jax.vmap(unroll_of.__wrapped__(MARKED))
+    together = jax.tree.map(lambda *x: jnp.stack(x), *begun)
+    text = str(jax.make_jaxpr(program)(together, keys, keys))
+    assert (" cond[" in text) == (backend == "gpu")
+    steps = []
+    for i in range(unrolls):
+        together, transitions = program(together, jnp.stack([each[i] for each in noise]), keys)
+        steps.append(transitions)
+    monkeypatch.undo()
+    for member, lanes in enumerate(begun):
+        for i in range(unrolls):
+            lanes, alone = unroll_of(MARKED)(lanes, noise[member][i], keys[member])
+            for ours, expected in zip(jax.tree.leaves(steps[i]), jax.tree.leaves(alone), strict=True):
+                np.testing.assert_allclose(ours[member], expected, rtol=1e-5, atol=1e-5)
+        # A start that is drawn early has the number that it would have had.
+        mine = jax.tree.map(lambda x, member=member: x[member], together)
+        np.testing.assert_array_equal(
+            mine.reset_count + mine.next_state_used, lanes.reset_count + lanes.next_state_used
+        )
+        assert lanes.reset_count.max() > 1
 
 
 def test_a_lane_flies_as_it_would_without_its_neighbors() -> None:

@@ -216,6 +216,21 @@ def test_a_product_of_ratios_may_overflow() -> None:
         np.testing.assert_array_equal(output, zeros)
 
 
+@pytest.mark.parametrize("flag", ["terminated", "truncated"])
+def test_what_overflows_after_an_end_stays_there(flag: str) -> None:
+    """Without clips; what precedes the end is what it is with ratios of 1 after it."""
+    end, big = 20, np.float32(1e30)
+    ended = trajectory(0, end_rate=0.0)._replace(**{flag: np.arange(T) == end})
+    outputs = []
+    for ratio in (1.0, big):
+        rho = np.where(np.arange(T) > end, ratio, ended.rho)
+        single = Trajectory(*(x.astype(np.float32) for x in ended._replace(rho=rho)))
+        outputs.append(ours(single, rho_bar=big, c_bar=big))
+    for expected, found in zip(*outputs, strict=True):
+        assert not np.isfinite(found[end + 1 :]).all()
+        np.testing.assert_array_equal(found[: end + 1], expected[: end + 1])
+
+
 @pytest.mark.parametrize(("flag", "share"), [("terminated", 0.0), ("truncated", GAMMA)])
 def test_bootstrap_follows_a_truncation_and_not_a_termination(flag: str, share: float) -> None:
     """Partial-episode bootstrapping (Pardo et al. 2018): one more V(s') at the end adds gamma there, or nothing."""

@@ -113,6 +113,7 @@ def test_each_flight_has_its_own_vehicle_and_begins_in_its_hover() -> None:
         ({"distribution": "quadrotor"}, "quadrotors"),
         ({"distribution": {"thrust_per_weight": [0.5, 2.0]}}, "thrust_per_weight"),
         ({"distribution": {"moment_z_factor": 2.0}}, "rigid body"),
+        ({"distribution": {"thrust_curve": [-5.0, 0.0]}}, "thrust_curve from -0.9 to 1"),
         ({"uncertainty": {"rotor_lag_factor": [0.5, 2.0]}}, "rotor_lag"),
     ],
 )

@@ -1,4 +1,4 @@
-"""What each number in and out is called: DESIGN.md, "Frames, units, order" and "Kernel"."""
+"""What each number in and out is called: its frame, unit and place in the order."""
 
 import pytest
 
@@ -43,6 +43,18 @@ def test_actions_of_another_vehicle() -> None:
     for port in found:
         assert (port.scale, port.low, port.high) == (pytest.approx(0.03 * 9.81 / 4), 0.0, 0.14375)
         assert port.safe == pytest.approx(0.03 * 9.81 / 4, rel=1e-3)
+
+
+def test_rotor_speeds_reach_down_to_the_least_thrust() -> None:
+    """As in the plant, which clips there: c·w + (1 − c)·w² = min/max."""
+    spec = tasks.load("track", "cf21_brushless")
+    assert isinstance(spec, tasks.QuadrotorTask)
+    ports = io_spec.actions(spec.model_copy(update={"action": "rotor_speed"}))
+    for port, motor in zip(ports, spec.vehicle.motors, strict=True):
+        c = spec.vehicle.thrust_curve
+        assert 0.0 < port.low < port.safe
+        assert c * port.low + (1.0 - c) * port.low**2 == pytest.approx(motor.min_N / motor.max_N, abs=1e-4)
+    assert [port.low for port in io_spec.actions(tasks.load("any"))] == [0.0] * 4
 
 
 def test_ports_of_the_pendulum() -> None:

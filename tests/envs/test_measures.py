@@ -1,4 +1,4 @@
-"""Success, settle time and steady-state errors as DESIGN.md, "Evaluation", defines them."""
+"""Success, settle time and steady-state errors as README's "Results" defines them."""
 
 import math
 from collections.abc import Callable

@@ -122,6 +122,35 @@ def test_without_lag_and_disturbance_it_is_the_papers_world_integrated_finely(mo
     np.testing.assert_allclose(flat(jax.tree.map(np.asarray, end)), x, atol=1e-3)
 
 
+@pytest.mark.parametrize(("latency_s", "late"), [(0.0, False), (0.004, False), (0.006, True), (0.01, True)])
+def test_without_lag_a_latency_counts_to_the_nearest_step(latency_s: float, late: bool) -> None:
+    """Up from hover by 2 N a motor: 8 N / 0.667 kg for 10 ms, or nothing yet."""
+    spec = task.load("hover")
+    assert isinstance(spec, task.QuadrotorTask)
+    env = RealQuadrotorEnv(spec, fixed(latency_s=latency_s))
+    start = jax.jit(env.reset)(jax.random.PRNGKey(0))
+    level = start.pipeline_state.x.body._replace(
+        pose=start.pipeline_state.x.body.pose._replace(attitude=jnp.array([1.0, 0.0, 0.0, 0.0])),
+        twist=jax.tree.map(jnp.zeros_like, start.pipeline_state.x.body.twist),
+    )
+    x = start.pipeline_state.x._replace(body=level)
+    state = start.replace(pipeline_state=start.pipeline_state._replace(x=x))
+    after = jax.jit(env.step)(state, jnp.full(4, 2.0 / 6.0)).pipeline_state.x.body.twist.velocity_m_s
+    np.testing.assert_allclose(after, [0.0, 0.0, 0.0 if late else 0.08 / 0.667], atol=1e-4)
+
+
+@pytest.mark.parametrize(("period_s", "steps"), [(0.002, 1), (0.01, 1), (0.014, 2), (0.02, 2), (0.025, 3)])
+def test_a_period_is_integrated_in_steps_of_10_ms_at_most(
+    period_s: float, steps: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = []
+    monkeypatch.setattr(plant.integrate, "midpoint", lambda f, g, body, step_s: (made.append(step_s), body)[1])
+    spec = real_task("cf21_brushless").model_copy(update={"control_period_s": period_s})
+    env = RealQuadrotorEnv(spec)
+    jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(4)), jax.random.PRNGKey(0))
+    assert made == pytest.approx([period_s / steps] * steps)
+
+
 @pytest.mark.parametrize("curve", [-0.5, 0.0, 0.3, 1.0])
 def test_speed_is_the_inverse_of_thrust(curve: float) -> None:
     """By NumPy's roots; its slope is finite everywhere."""

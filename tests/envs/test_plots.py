@@ -325,6 +325,17 @@ def test_the_speed_of_a_clockwise_circle_is_shown_the_right_way_up() -> None:
         assert min(-speed, 3 * speed) <= low < speed < high <= max(-speed, 3 * speed)
 
 
+@pytest.mark.parametrize("speed", [2.0, -2.0])
+def test_arrows_on_the_circle_point_along_the_flight(speed: float) -> None:
+    wanted = {"reward": {"speed_m_s": speed}}
+    spec = task.from_data({"extend": "circle", **wanted, "evaluation": wanted}, "mine")
+    arrows = [each for each in flights_of.figure(spec, approach("circle")).axes[0].texts if each.get_text() == ""]
+    for arrow in arrows:
+        (x, y), (from_x, from_y) = arrow.xy, arrow.xyann  # pyright: ignore[reportAttributeAccessIssue]
+        assert np.sign(from_x * y - from_y * x) == np.sign(speed)
+    assert len(arrows) == 2
+
+
 @pytest.mark.parametrize(("comes_to", "lowest"), [(0.003, 0.001), (1e-9, 2e-5), (0.1, 0.002), (np.nan, 0.002)], ids=str)
 def test_a_logarithmic_axis_reaches_down_to_what_the_lines_come_to(comes_to: float, lowest: float) -> None:
     """A third of it, within 1e-4 to 1e-2 of the tolerance, here 0.2 m; not of how they begin."""

@@ -14,7 +14,7 @@ from qrl_envs.env import from_task
 from qrl_envs.quadrotor_env import RealQuadrotorEnv
 from qrl_envs.reference import FixedReference, Random, evaluation_s
 from qrl_envs.specfile import BadInput
-from qrl_envs.target import Figure, Motion, Sines
+from qrl_envs.target import Motion, Sines, follow
 
 POINTS = [[0.0, 0.0, 0.0], [1.0, 0.2, 0.3], [1.2, 1.0, -0.1], [-0.5, 0.8, 0.2], [0.0, 0.0, 0.0]]
 TIMES = [0.0, 1.1, 2.0, 3.4, 5.0]
@@ -107,23 +107,25 @@ def test_an_evaluation_is_measured_after_the_first_lap_or_2_s() -> None:
 # In flight
 
 
-@pytest.mark.parametrize("name", ["circle", "waypoints"])
+@pytest.mark.parametrize("name", ["circle", "eight", "waypoints"])
 def test_a_figure_in_flight_is_the_figure(name: str) -> None:
-    """Of many flights along the last axis, each at its own place; the preview is the velocity then minus now."""
+    """Of many flights along the last axis, each at its own place, for as long as they last; the preview is the velocity
+    then minus now.
+    """
     spec, dt = built(name), 0.02
-    figure = Figure(spec, dt, 4.0, [0.1, 0.5], anywhere=True)
+    figure: Any = follow(spec, dt, [0.1, 0.5], anywhere=True)
     begins = jnp.stack([figure.draw(jnp.array([u]), None, None) for u in (0.0, 0.3, 0.999)])  # pyright: ignore[reportArgumentType]
     lap = spec.lap_s or 0.0
     assert (np.asarray(begins) > 0).tolist() == [False, True, True]
     assert float(begins[-1]) * dt < (lap or spec.duration_s)
-    steps = jnp.array([0, 7, 150])
-    target = figure.at(begins, steps)
-    times = np.asarray(begins + steps) * dt
-    now = spec.at(times)
-    np.testing.assert_allclose(target.position_m.T, now.position_m, atol=1e-6)
-    np.testing.assert_allclose(target.velocity_m_s.T, now.velocity_m_s, atol=1e-6)
-    later = [spec.at(times + ahead).velocity_m_s - now.velocity_m_s for ahead in (0.1, 0.5)]
-    np.testing.assert_allclose(target.preview_m_s.T, np.concatenate(later, axis=1), atol=1e-5)
+    for steps in (jnp.array([0, 7, 150]), jnp.array([700, 1400, 2500])):
+        found = figure.at(begins, steps)
+        times = np.asarray(begins + steps) * dt
+        now = spec.at(times)
+        np.testing.assert_allclose(found.position_m.T, now.position_m, atol=5e-5)
+        np.testing.assert_allclose(found.velocity_m_s.T, now.velocity_m_s, atol=5e-5)
+        later = [spec.at(times + ahead).velocity_m_s - now.velocity_m_s for ahead in (0.1, 0.5)]
+        np.testing.assert_allclose(found.preview_m_s.T, np.concatenate(later, axis=1), atol=1e-4)
 
 
 def motions(n: int, **values: Any) -> tuple[Motion, Sines]:

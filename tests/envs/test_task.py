@@ -10,6 +10,7 @@ import pytest
 
 from qrl_envs import task
 from qrl_envs.specfile import BadInput
+from qrl_envs.vehicle import vehicle_data
 
 SHIPPED = {name: task.load(name).model_dump(mode="json") for name in task.shipped()}
 MOTOR = '{"position_m": [0.1, 0.1], "spin": %s, "max_N": %s}'
@@ -283,7 +284,7 @@ def four(*positions: tuple[float, float], spins: tuple[int, ...] = (1, -1, 1, -1
 CANNOT_FLY = {
     "center of mass outside": (
         {"motors": four((-0.02, 0.1), (-0.3, 0.1), (-0.3, -0.1), (-0.02, -0.1))},
-        "around the center of mass",
+        "around the center of mass, and spins",
     ),
     "more than a motor has": (
         {"motors": four((0.01, 0.1), (-0.3, 0.1), (-0.3, -0.1), (0.01, -0.1)), "mass_kg": 2.0},
@@ -305,7 +306,9 @@ def test_a_vehicle_that_cannot_fly_is_refused_with_the_reason(changes: dict, wor
 
 
 def test_what_can_only_just_fly_is_warned_about(path: Path) -> None:
-    """Little thrust to spare; yaw that comes with roll only; hardly any yaw. The paper's vehicle gets no warning."""
+    """Little thrust to spare, or that actions reach; yaw that comes with roll only; hardly any yaw; a wrong spin. The
+    paper's vehicle gets no warning.
+    """
     for changes, words in (
         ({"mass_kg": 2.7}, "can only just hover"),
         (
@@ -314,6 +317,11 @@ def test_what_can_only_just_fly_is_warned_about(path: Path) -> None:
         ),
         ({"yaw_moment_m": 1e-9}, "hardly turn about body z"),
         ({"action_scale_N": 20.0}, "nearly every action is a motor's limit"),
+        ({"action_scale_N": 0.3}, "actions reach 1.18 of the weight, and its motors 4.89"),
+        (
+            {"motors": four((0.1, 0.1), (-0.1, 0.1), (-0.1, -0.1), (0.1, -0.1), spins=(1, 1, 1, -1))},
+            "in hover motor 1 carries 0 N and motor 2 3.3 N: check motors.position_m and motors.spin",
+        ),
     ):
         (warning,) = load(path, vehicle(changes)).warnings()
         assert words in warning
@@ -442,6 +450,21 @@ def test_circles_of_any_size_and_sense(path: Path) -> None:
 def test_bounds_within_the_starts_are_refused(path: Path) -> None:
     with pytest.raises(BadInput, match=r"bounds\.distance_m beyond the starts"):
         load(path, hover('"bounds": {"distance_m": 1.5}'))
+    with pytest.raises(BadInput, match=r"bounds\.body_rate_rad_s beyond the starts, which reach 1\.73 rad/s"):
+        load(path, hover('"bounds": {"body_rate_rad_s": 1.5}'))
+
+
+def test_a_lagged_vehicle_brings_no_weights_to_a_reward_of_another_form(path: Path) -> None:
+    ring = {"form": "circle", "w4_distance_1_m": 1.0, "w6_action": 0.01, "radius_m": 1.0, "speed_m_s": 1.0}
+    judged = {"reward": ring, "speed_m_s": 0.2}
+    mine = load(path, json.dumps({"extend": "hover", "vehicle": "crazyflie", "reward": ring, "evaluation": judged}))
+    assert mine.reward == task.CircleReward(**ring, w5_direction_s_m2=0.5)
+
+
+def test_the_vehicle_of_a_task_is_read_by_object_or_name(path: Path) -> None:
+    for given in ("crazyflie", vehicle_data("crazyflie")):
+        path.write_text(json.dumps({"extend": "hover", "vehicle": given}))
+        assert vehicle_data(str(path)) == vehicle_data("crazyflie")
 
 
 def test_an_ideal_vehicle_is_written_as_it_was_before_it_could_lag(path: Path) -> None:

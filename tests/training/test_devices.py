@@ -39,6 +39,9 @@ def config(**changes: object) -> Config:
         ({}, 3, 2, 2),
         ({"num_shards": 1}, 1, 2, 1),
         ({}, 1, 3, 2),  # three cannot divide eight shards
+        ({"policy_hidden_layer_sizes": []}, 1, 2, 2),
+        ({"policy_hidden_layer_sizes": [], "critic_hidden_layer_sizes": [64]}, 1, 2, 2),
+        ({"policy_hidden_layer_sizes": [], "critic_hidden_layer_sizes": []}, 1, 2, 1),
     ],
 )
 def test_as_many_devices_as_have_enough_to_do(changes: dict, seeds: int, cores: int, devices: int) -> None:

@@ -88,7 +88,8 @@ def _circle(axes: Axes, target: CircleReward) -> None:
     axes.plot(x, y, "--", color="black", linewidth=1.5, zorder=5, label="target circle")
     arrow = {"arrowstyle": "-|>", "color": "black", "mutation_scale": 22, "shrinkA": 0, "shrinkB": 0}
     for k in (22, 112):
-        axes.annotate("", xy=(x[k + 3], y[k + 3]), xytext=(x[k], y[k]), arrowprops=arrow, zorder=6)
+        to = k + (3 if target.speed_m_s > 0.0 else -3)
+        axes.annotate("", xy=(x[to], y[to]), xytext=(x[k], y[k]), arrowprops=arrow, zorder=6)
     axes.text(0, 0, f"{target.speed_m_s:g} m/s", ha="center", va="center", color=INK, fontsize=11)
 
 

@@ -177,6 +177,7 @@ def _vehicle(task: QuadrotorTask, samples: int, stride: int) -> dict[str, Any]:
         else {"name": "thrust", "unit": "N"},
         "wanted": {
             "radius_m": wanted.radius_m if isinstance(wanted, CircleReward) else 0.0,
+            "clockwise": isinstance(wanted, CircleReward) and wanted.speed_m_s < 0.0,
             "path_m": path,
             "tolerance_m": task.evaluation.distance_m,
         },

@@ -73,12 +73,12 @@ function meshTrace(shape, more) {
 
 const line3d = (x, y, z, line) => ({ type: "scatter3d", mode: "lines", x, y, z, line, hoverinfo: "skip" });
 
-function arrowheads(radius, size, count, color) { // counter-clockwise, on the circle
+function arrowheads(radius, size, count, color) { // on the circle; counter-clockwise for a size above 0
   const shape = mesh();
   for (let n = 0; n < count; n++) {
     const angle = 2 * Math.PI * n / count + 0.4, c = Math.cos(angle), s = Math.sin(angle);
     const place = (along, out) => [radius * c - along * s + out * c, radius * s + along * c + out * s];
-    shape.prism([place(size, 0), place(-size, 0.6 * size), place(-size, -0.6 * size)], -0.08 * size, 0.08 * size, color);
+    shape.prism([place(size, 0), place(-size, 0.6 * size), place(-size, -0.6 * size)], -0.08 * Math.abs(size), 0.08 * Math.abs(size), color);
   }
   return shape;
 }
@@ -154,7 +154,7 @@ function vehicleScene(div, page, onCamera) {
     if (wanted.radius_m) {
       const turn = Array.from({ length: 145 }, (_, i) => 2 * Math.PI * i / 144);
       all.push(line3d(turn.map(a => wanted.radius_m * Math.cos(a)), turn.map(a => wanted.radius_m * Math.sin(a)), turn.map(() => 0), { color: "#007a59", width: 4, dash: "dash" }));
-      const arrows = arrowheads(wanted.radius_m, 0.1 * wanted.radius_m, 4, "#007a59");
+      const arrows = arrowheads(wanted.radius_m, 0.1 * wanted.radius_m * (wanted.clockwise ? -1 : 1), 4, "#007a59");
       all.push(meshTrace(arrows, { facecolor: arrows.colors, lighting: light }));
     } else {
       all.push({ type: "scatter3d", mode: "markers", x: [0], y: [0], z: [0], hoverinfo: "skip", marker: { color: "#007a59", size: 5, symbol: "diamond" } });

@@ -2,7 +2,7 @@
 
 A slot holds one unroll of all lanes, leaves [N, T, ...], and of each lane what has no time axis, [N, ...]: its final
 observations, and the memory that it began with. A full buffer overwrites its oldest slot. `inserted` must stay
-unbatched where members are vmapped: a batched cursor turns the slice update into a scatter.
+unbatched where members are vmapped: with a cursor for each member a slice update is a scatter.
 """
 
 from typing import NamedTuple

@@ -132,7 +132,7 @@ class Steps:
             unused = jnp.zeros_like(lanes.next_state_used)
             return lanes._replace(next_state=next_state, reset_count=reset_count, next_state_used=unused)
 
-        lanes = _at_most_once(lambda now: jnp.any(now.done & now.next_state_used), draw, lanes, cheap=False)
+        lanes = _at_most_once(lambda now: _any(now.done & now.next_state_used), draw, lanes, cheap=False)
         return lanes._replace(
             state=_chosen(lanes.done, lanes.next_state, lanes.state),
             steps=jnp.where(lanes.done, 0, lanes.steps),
@@ -146,6 +146,20 @@ class Steps:
         states = self._carried.unpack(carry, constant)
         after = self._env.step_lanes(states, stored(jnp.clip(action, -1.0, 1.0).T))
         return self._carried.follow(carry, after), after
+
+
+@jax.custom_batching.custom_vmap
+def _any(lanes: chex.Array) -> chex.Array:
+    """Whether any of the lanes [n] is chosen, of any member where members are vmapped: by predicates of their own a
+    condition would run both branches, always. It may ask only for what changes nothing where no lane is chosen.
+    """
+    return jnp.any(lanes)
+
+
+@_any.def_vmap
+def _any_of_members(axis_size: int, in_batched: Any, lanes: chex.Array) -> tuple[chex.Array, bool]:
+    del axis_size, in_batched
+    return jnp.any(lanes), False
 
 
 def _chosen(chosen: chex.Array, carry: Carry, other: Carry) -> Carry:
@@ -204,10 +218,10 @@ def _step(
     """
 
     def restart_done_lanes(now: UnrollCarry) -> UnrollCarry:
-        found = _at_most_once(lambda now: jnp.any(_first_truncation(now)), _record_final, now, cheap=True)
+        found = _at_most_once(lambda now: _any(_first_truncation(now)), _record_final, now, cheap=True)
         return found._replace(lanes=steps.restart(now.lanes, constant, start_key))
 
-    now = _at_most_once(lambda now: jnp.any(now.lanes.done), restart_done_lanes, now, cheap=True)
+    now = _at_most_once(lambda now: _any(now.lanes.done), restart_done_lanes, now, cheap=True)
     lanes = now.lanes
     observation = lanes.state.observation
     memory, center = policy(lanes.memory, observation)

@@ -48,7 +48,7 @@ def vtrace(
     carry_on = gamma * lam * (1.0 - terminated) * (1.0 - truncated)
 
     error = linear_recurrence(jnp.minimum(c_bar, rho) * carry_on, jnp.minimum(rho_bar, rho) * delta)
-    a_trace = delta + carry_on * jnp.append(error[1:], jnp.zeros_like(error[:1]))
+    a_trace = delta + _product(carry_on, jnp.append(error[1:], jnp.zeros_like(error[:1])))
     return Trace(a_trace, value + error)
 
 
@@ -58,11 +58,16 @@ def linear_recurrence(a: chex.Array, b: chex.Array) -> chex.Array:
     By doubling (Hillis and Steele 1986): round k gives each x_i in terms of x_{i + 2^k}, so that six rounds do for 50
     steps; a loop over the steps would be 50 launches on a GPU.
     """
-    most = jnp.finfo(a.dtype).max  # a product that overflows stays a number: after an end it is multiplied by 0
+    most = jnp.finfo(a.dtype).max  # a product that overflows stays a number, for it may be multiplied by 0
     steps, reach = len(b), 1
     while reach < steps:
-        b = jnp.concatenate([b[:-reach] + a[: steps - reach] * b[reach:], b[-reach:]])
+        b = jnp.concatenate([b[:-reach] + _product(a[: steps - reach], b[reach:]), b[-reach:]])
         a = jnp.minimum(a[:-reach] * a[reach:], most)  # of those that more than `reach` steps follow
         a, b = stored((a, b))
         reach *= 2
     return b
+
+
+def _product(a: chex.Array, b: chex.Array) -> chex.Array:
+    """a·b, and 0 where a is: what lies beyond an end stays there even where it overflows."""
+    return jnp.where(a == 0.0, 0.0, a * b)

@@ -66,7 +66,7 @@ def _requested_devices(environment: Mapping[str, str]) -> int:
 
 def _work(learner: Config) -> int:
     """Multiply-adds of an update's largest product."""
-    widest = max(*learner.policy_hidden_layer_sizes, *learner.critic_hidden_layer_sizes)
+    widest = max((1, *learner.policy_hidden_layer_sizes, *learner.critic_hidden_layer_sizes))
     return learner.batch_size * learner.unroll_length * widest**2
 
 

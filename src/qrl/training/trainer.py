@@ -22,7 +22,7 @@ from qrl.algorithm.learner import LearnerSpec, LearnerState, UpdateMetrics
 from qrl.algorithm.replay_buffer import ReplayBuffer
 from qrl.algorithm.rollout import Lanes
 from qrl.algorithm.types import Env, TaskEnv, Transition
-from qrl.config import Config, Hyperparameters
+from qrl.config import Config
 from qrl.training import sharding
 from qrl.training.sharding import LAYOUT, MEMBER, SHARD
 from qrl.training.state import FAULT_TERMS, MemberInputs, Totals, TrainState
@@ -98,7 +98,7 @@ def init_state(setup: Setup, seed: chex.Array, inputs: MemberInputs) -> TrainSta
 
 def collect(
     setup: Setup,
-    hyper: Hyperparameters,
+    inputs: MemberInputs,
     state: LearnerState,
     lanes: Lanes,
     buffer: ReplayBuffer,
@@ -106,13 +106,13 @@ def collect(
     start_key: chex.PRNGKey,
 ) -> tuple[Lanes, ReplayBuffer]:
     spec = setup.spec
-    acting = learner.with_scale_in_weights(spec, hyper, state)
+    acting = learner.with_scale_in_weights(spec, inputs.hyper, state)
     return rollout.unroll(
-        setup.env,  # of any parameters: each lane carries its own
+        setup.env_of(inputs),
         lanes,
         buffer,
         partial(learner.act, spec, *acting),
-        learner.sigma(hyper, state),
+        learner.sigma(inputs.hyper, state),
         noise_key,
         start_key,
         max_episode_steps=setup.max_episode_steps,
@@ -122,7 +122,7 @@ def collect(
 def train_step(setup: Setup, inputs: MemberInputs, state: TrainState) -> TrainState:
     """One unroll of all lanes into the replay buffer, and the updates that follow it (Algorithm 2)."""
     noise_key, sample_key = jax.random.split(jax.random.fold_in(state.key, state.unrolls))
-    lanes, buffer = collect(setup, inputs.hyper, state.learner, state.lanes, state.buffer, noise_key, state.start_key)
+    lanes, buffer = collect(setup, inputs, state.learner, state.lanes, state.buffer, noise_key, state.start_key)
     transitions = replay_buffer.newest(buffer)
     observed = learner.update_statistics(setup.spec, state.learner, transitions.observation, transitions.reward)
     learned, metrics = jax.lax.cond(
@@ -304,47 +304,55 @@ class Trainer(NamedTuple):
         return self.setup.config
 
 
+def _init_members(setup: Setup, seeds: chex.Array, inputs: MemberInputs) -> TrainState:
+    return sharding.map_members(lambda m: init_state(setup, *m), (seeds, inputs))
+
+
+def _train_members(setup: Setup, states: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
+    def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
+        return jax.lax.fori_loop(state.unrolls, until, lambda _, now: train_step(setup, inputs, now), state)
+
+    return sharding.map_states(one, states, inputs, until, states.unrolls < states.learning_unrolls)
+
+
+def _apg_members(setup: Setup, states: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
+    config = setup.config
+
+    def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
+        first = (state.unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
+        count = (until - state.unrolls) // config.unrolls_per_apg_update
+        split = jnp.int32(0)
+        if config.apg_split > 1 and config.apg_split_fraction:  # two loops: a condition would run both under vmap
+            split = jnp.clip(split_apg_updates(config, state.learning_unrolls) - first, 0, count)
+            parts = lambda i, now: apg_step(setup, inputs, first + i, now, config.apg_split)  # noqa: E731
+            state = jax.lax.fori_loop(0, split, parts, state)
+        step = lambda i, now: apg_step(setup, inputs, first + i, now)  # noqa: E731
+        return jax.lax.fori_loop(split, count, step, state)._replace(unrolls=until)
+
+    # Not a member that has just been brought to `until`, where its APG begins.
+    active = (states.unrolls >= states.learning_unrolls) & (states.unrolls < until)
+    return sharding.map_states(one, states, inputs, until, active)
+
+
+def _fly_members(setup: Setup, learners: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
+    return sharding.map_members(lambda m: fly(setup, m[0], m[1], keys), (learners, inputs))
+
+
+def _fly_padded(setup: Setup, learners: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
+    """Every device flies as many starts: a few are flown twice, and dropped."""
+    count, devices = len(keys), sharding.num_shard_devices(setup.mesh)
+    padded = jnp.resize(keys, (-(-count // devices) * devices, *keys.shape[1:]))
+    specs = (P(MEMBER), P(MEMBER), P(SHARD)), P(MEMBER, SHARD)
+    program = sharding.shard_map(setup.mesh, partial(_fly_members, setup), *specs)
+    return jax.tree.map(lambda x: x[:, :count], program(learners, inputs, padded))
+
+
 def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
     """The programs of an environment and a configuration, on one device or over a mesh whose member axis divides M."""
     setup = Setup(adapt(env), config, mesh)
 
-    def init(seeds: chex.Array, inputs: MemberInputs) -> TrainState:
-        return sharding.map_members(lambda m: init_state(setup, *m), (seeds, inputs))
-
-    def train(states: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
-        def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
-            return jax.lax.fori_loop(state.unrolls, until, lambda _, now: train_step(setup, inputs, now), state)
-
-        return sharding.map_states(one, states, inputs, until, states.unrolls < states.learning_unrolls)
-
-    def apg(states: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
-        def one(state: TrainState, inputs: MemberInputs, until: chex.Array) -> TrainState:
-            first = (state.unrolls - state.learning_unrolls) // config.unrolls_per_apg_update
-            count = (until - state.unrolls) // config.unrolls_per_apg_update
-            split = jnp.int32(0)
-            if config.apg_split > 1 and config.apg_split_fraction:  # two loops: a condition would run both under vmap
-                split = jnp.clip(split_apg_updates(config, state.learning_unrolls) - first, 0, count)
-                parts = lambda i, now: apg_step(setup, inputs, first + i, now, config.apg_split)  # noqa: E731
-                state = jax.lax.fori_loop(0, split, parts, state)
-            step = lambda i, now: apg_step(setup, inputs, first + i, now)  # noqa: E731
-            return jax.lax.fori_loop(split, count, step, state)._replace(unrolls=until)
-
-        # Not a member that has just been brought to `until`, where its APG begins.
-        active = (states.unrolls >= states.learning_unrolls) & (states.unrolls < until)
-        return sharding.map_states(one, states, inputs, until, active)
-
-    def fly_members(learners: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
-        return sharding.map_members(lambda m: fly(setup, m[0], m[1], keys), (learners, inputs))
-
-    def fly_padded(learners: LearnerState, inputs: MemberInputs, keys: chex.PRNGKey) -> Flights:
-        """Every device flies as many starts: a few are flown twice, and dropped."""
-        count, devices = len(keys), sharding.num_shard_devices(mesh)
-        padded = jnp.resize(keys, (-(-count // devices) * devices, *keys.shape[1:]))
-        program = sharding.shard_map(mesh, fly_members, (P(MEMBER), P(MEMBER), P(SHARD)), P(MEMBER, SHARD))
-        return jax.tree.map(lambda x: x[:, :count], program(learners, inputs, padded))
-
     def over_mesh(program: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
-        return sharding.shard_map(mesh, program, in_specs, LAYOUT)
+        return sharding.shard_map(mesh, partial(program, setup), in_specs, LAYOUT)
 
     everywhere = sharding.replicated(mesh)
     replicate = jax.jit(lambda tree: tree, out_shardings=everywhere)
@@ -369,14 +377,18 @@ def make_trainer(env: Env, config: Config, mesh: Mesh | None = None) -> Trainer:
         yield from (jax.tree.map(lambda x, i=i: x[i], copy) for i in range(count))
 
     def jitted(name: str, program: Callable[..., Any]) -> Any:
-        return jax.jit(program, donate_argnums=DONATED.get(name, ()), compiler_options=effort(name))
+        def named(*args: Any) -> Any:
+            return program(*args)
+
+        named.__name__ = name  # in compile caches and profiles
+        return jax.jit(named, donate_argnums=DONATED.get(name, ()), compiler_options=effort(name))
 
     return Trainer(
         setup,
-        init=jitted("init", over_mesh(init, (P(MEMBER), P(MEMBER)))),
-        train=jitted("train", over_mesh(train, steps)),
-        apg=jitted("apg", over_mesh(apg, steps)),
-        fly=jitted("fly", fly_padded),
+        init=jitted("init", over_mesh(_init_members, (P(MEMBER), P(MEMBER)))),
+        train=jitted("train", over_mesh(_train_members, steps)),
+        apg=jitted("apg", over_mesh(_apg_members, steps)),
+        fly=jitted("fly", partial(_fly_padded, setup)),
         effort=effort,
         gather=gather,
         members=members,
