@@ -71,6 +71,10 @@ flag = $(if $2,$1 $(call quoted,$2))
 # Stop with one line, before anything is built, where the goal $1 lacks what it needs; $3 is how to call it.
 need = $(if $(filter $1,$(MAKECMDGOALS)),$(if $2,,$(error $3)))
 
+# What a run is comes from the command line alone: some systems, say, have a NAME in the environment.
+$(foreach name,TASK VEHICLE UNCERTAINTY REFERENCE INIT CONFIG SEED SEEDS FIRST OUT RESUME LOG RUN NAME GRID FAST, \
+	$(if $(filter environment,$(origin $(name))),$(eval undefine $(name))))
+
 # A run's config.json names its own task.
 $(call need,train,$(TASK)$(CONFIG),TASK is missing: make train TASK=circle ("make tasks" lists them))
 $(call need,seeds,$(TASK),TASK is missing: make seeds TASK=circle ("make tasks" lists them))
@@ -133,7 +137,7 @@ bench: $(STAMP)
 gpu: $(if $(findstring --any-device,$(ARGS)),$(STAMP),$(CUDA))
 	@exec $(VENV)/bin/python -m experiments.gpu.run $(ARGS)
 
-# Two processes: on the two cores that the ten minutes are promised for. Each begins with half of the tests, those of a
+# Two processes, for two cores. Each begins with half of the tests, those of a
 # file together, for they share what they train; one that is done takes over tests of the other.
 WORKERS := -n 2 --dist worksteal
 

@@ -90,6 +90,28 @@ def test_task_vehicle_config_seed_and_out_are_positional(asked: list[Any]) -> No
     assert (run.learner, run.seed, asked[-1].out) == (config, 7, Path("here"))
 
 
+def test_a_config_is_all_there_is(asked: list[Any], tmp_path: Path) -> None:
+    """Also where it has a default, which is not written to files, and the task's preset has not."""
+    (tmp_path / "mine.json").write_text('{"extend": "pendulum", "preset": "track"}')
+    config = qrl.Config.preset("pendulum")
+    assert planned(asked, "mine.json", config=config).learner == config
+
+
+def test_without_a_seed_it_is_that_of_the_file_or_of_the_run(asked: list[Any], tmp_path: Path) -> None:
+    (tmp_path / "mine.json").write_text('{"seed": 7}')
+    assert planned(asked, "pendulum", config="mine.json", out="a").seed == 7
+    assert planned(asked, "pendulum", out="a", resume=True).seed == 7
+    assert planned(asked, "pendulum", out="b").seed == 0
+
+
+def test_a_share_too_small_for_apg_is_said(asked: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """Of 250 unrolls of 800 steps, for flights of 64 × 200."""
+    for fraction, said in ((0.05, 1), (0.1, 0)):
+        planned(asked, "pendulum", apg_fraction=fraction, out=str(fraction))
+        line = f"warning: apg_fraction {fraction}: no update of APG, which takes 12,800 steps, fits into that share of"
+        assert capsys.readouterr().err.count(f"qrl: {line} 200,000\n") == said
+
+
 def test_a_vehicle_flies_the_task(asked: list[Any]) -> None:
     assert planned(asked, "circle", "crazyflie").task.spec["vehicle"]["mass_kg"] == 0.03
     assert asked[-1].out == Path("runs/circle_crazyflie")

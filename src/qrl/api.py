@@ -117,7 +117,7 @@ def train(
     task: str | Path,
     vehicle: str | Path | None = None,
     config: Config | str | Path | None = None,
-    seed: int = 0,
+    seed: int | None = None,
     out: str | Path | None = None,
     *,
     uncertainty: str | Path | None = None,
@@ -133,6 +133,7 @@ def train(
     task: a name (`qrl tasks` lists them), a path to a .json, or "module:factory" of an environment of your own
     vehicle: a shipped vehicle's name or a path to a .json, in place of the task's own
     config: a Config, or a config.json, whole or in part
+    seed: by default that of the config.json or of the run that is resumed, else 0
     out: the run folder, by default runs/TASK
     uncertainty: what differs from flight to flight, a shipped name or a path to a .json, in place of the task's own
     reference: what a task tracks and is judged on, a shipped name or a path to a .json or .csv, in place of its own
@@ -152,7 +153,7 @@ def train(
     if isinstance(config, Config):
         if preset is not None:
             raise BadInput("qrl.train: expected preset or a Config, found both: a Config has all hyperparameters")
-        hyperparameters, config = config.model_dump() | _checked(hyperparameters), None
+        hyperparameters, config = dict(config) | _checked(hyperparameters), None
     flags = {f"learner.{name}": value for name, value in _checked(hyperparameters).items()}
     folder = Path(out) if out else Path("runs") / tasks.folder_name(tasks.task_record(str(task), parts))
     if not resume and (folder / "config.json").exists():
@@ -161,7 +162,7 @@ def train(
         task=str(task),
         **parts,
         config=Path(config) if config else None,
-        seed=_valid("seed", CountOrZero, seed),
+        seed=None if seed is None else _valid("seed", CountOrZero, seed),
         seeds=1,
         out=folder,
         preset=preset,

@@ -188,6 +188,11 @@ class Config(BaseModel):
                 f"expected apg_episode_length to be a multiple of apg_split = {self.apg_split}, found"
                 f" {self.apg_episode_length}"
             )
+        if (self.apg_split > 1) != (self.apg_split_fraction > 0.0):
+            raise ValueError(
+                "expected apg_split above 1 and apg_split_fraction above 0, or neither, found"
+                f" {self.apg_split} and {self.apg_split_fraction:g}"
+            )
         for name in ("num_envs", "batch_size", *(["apg_num_envs"] if self.num_apg_updates else [])):
             if (value := getattr(self, name)) % self.shard_count:
                 raise ValueError(f"expected {name} to be a multiple of num_shards = {self.shard_count}, found {value}")
@@ -282,6 +287,14 @@ def current_names(values: Mapping[str, Any], where: str) -> dict[str, Any]:
         if former in values and name in values:
             raise BadInput(f"{where}: key '{former}': is called '{name}' now, and both are given")
     return {FORMER_NAMES.get(name, name): value for name, value in values.items()}
+
+
+def with_defaults(values: Mapping[str, Any]) -> dict[str, Any]:
+    """`values` and, where they are whole, what such a record leaves out since it is at its default; a part as it is."""
+    fields = Config.model_fields.items()
+    if any(field.is_required() and name not in values for name, field in fields):
+        return dict(values)
+    return {name: field.default for name, field in fields if not field.is_required()} | dict(values)
 
 
 def load_preset(name: str) -> dict[str, Any]:

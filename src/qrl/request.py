@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any
 
 from qrl import tasks
-from qrl.config import Config
+from qrl.config import Config, with_defaults
 from qrl.runs import record as records
 from qrl.runs.record import ConfigFile, Init, RunConfig, TaskRecord
 from qrl.training.devices import device_names
@@ -16,7 +16,7 @@ from qrl_envs.task import shipped
 
 
 def config_file(path: Path | None) -> ConfigFile:
-    """What CONFIG holds, its task checked; nothing where there is no CONFIG."""
+    """What CONFIG holds, its task checked, a learner that is whole with all it leaves out; nothing without a CONFIG."""
     if path is None:
         return ConfigFile()
     file = specfile.build(ConfigFile, records.with_current_names(specfile.read(path), str(path)), str(path))
@@ -25,7 +25,7 @@ def config_file(path: Path | None) -> ConfigFile:
         record = tasks.task_named(record, path)
     elif record:
         record = tasks.check_task_record(record, str(path))
-    return file.model_copy(update={"task": record})
+    return file.model_copy(update={"task": record, "learner": with_defaults(file.learner)})
 
 
 def run_config(

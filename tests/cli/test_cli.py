@@ -15,7 +15,7 @@ from qrl_envs.plots import errors
 
 
 def test_training_leaves_the_run_folder(trained: Path) -> None:
-    """DESIGN.md, "Run folder"."""
+    """What other tools find in a run folder."""
     present = {path.name for path in trained.iterdir()}
     assert {"config.json", "metrics.csv", "checkpoints", "tensorboard", "summary.json"} <= present
     assert {"learning_curve.png", "flight.png"} <= present

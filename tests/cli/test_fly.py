@@ -1,6 +1,9 @@
 """The runs that ship, and `qrl fly`."""
 
 import argparse
+import errno
+import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -38,6 +41,28 @@ def test_a_run_that_ships_is_copied_once(package: Path) -> None:
     assert (other / "checkpoints/100/manifest.json").read_text() == "two"
     assert (copy / "view.html").exists()
     assert sorted(copy.parent.iterdir()) == sorted([copy, other])
+
+
+@pytest.mark.usefixtures("package")
+def test_a_copy_that_fails_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By its name; nothing of it stays."""
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(shutil, "copytree", full)
+    with pytest.raises(OSError, match=r"^runs/shipped/any-\w{8}: cannot be written \(No space left on device\)$"):
+        shipped.run_folder(Path("any"))
+    assert not [*Path("runs/shipped").iterdir()]
+
+
+def test_another_process_may_copy_it_first(package: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(_: Path, target: Path) -> None:
+        shutil.copytree(package, target)
+        raise OSError(errno.ENOTEMPTY, os.strerror(errno.ENOTEMPTY))
+
+    monkeypatch.setattr(Path, "rename", late)
+    assert (shipped.run_folder(Path("any")) / "checkpoints/100/manifest.json").read_text() == "one"
 
 
 @pytest.mark.usefixtures("package")

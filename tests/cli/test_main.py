@@ -3,16 +3,22 @@
 import gc
 import json
 import os
+import sys
+from contextlib import suppress
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+from pydantic import ValidationError
 
-from qrl import tasks
+from qrl import request, tasks
 from qrl.cli import main as cli
 from qrl.cli.arguments import parse
 from qrl.cli.main import RARE_COLLECTIONS, _note_former_names, limit_size, main
-from qrl.config import FORMER_NAMES, Config
+from qrl.config import FORMER_NAMES, Config, load_preset, preset_names
 from qrl.request import config_file
+from qrl.runs import files
+from qrl.runs.record import ConfigFile
 from qrl_envs.specfile import BadInput
 
 
@@ -24,6 +30,20 @@ def test_garbage_is_collected_rarely_in_a_command(code: int, monkeypatch: pytest
     assert main(["tasks"] if code == 0 else ["view", "no such run"]) == code
     assert within == [(True, RARE_COLLECTIONS)]
     assert gc.get_threshold() == before
+
+
+def test_ctrl_c_in_an_import_is_said_in_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Interrupted(ModuleType):
+        def __getattr__(self, name: str) -> object:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, suppress(KeyboardInterrupt):  # which would end the tests
+        patch.setattr(cli, "configure_jax", lambda: None)
+        patch.setitem(sys.modules, "qrl.training.driver", Interrupted("driver"))
+        assert main(["view", "no such run"]) == 1
+    assert capsys.readouterr().err == "qrl: interrupted\n"
 
 
 @pytest.mark.parametrize(("former", "name"), FORMER_NAMES.items())
@@ -43,6 +63,30 @@ def test_former_names_in_a_file_are_those_of_today(tmp_path: Path) -> None:
     path.write_text('{"learner": {"lanes": 8, "num_envs": 8}}')
     with pytest.raises(BadInput, match=r"config\.json: learner: key 'lanes': is called 'num_envs' now"):
         config_file(path)
+
+
+def test_a_whole_record_repeats_its_run(tmp_path: Path) -> None:
+    """Also where it has a default, which is not written, and its task's preset has not; a part is laid over that."""
+    plain = {"policy_gru_size": None, "apg_split": 1, "apg_split_fraction": 0.0, "apg_cotangent_norm": None}
+    run = request.run_config("track", None, ConfigFile(), plain, None, None)
+    path = tmp_path / "config.json"
+    files.write_json(path, run.model_dump(mode="json"))
+    assert not plain.keys() & json.loads(path.read_text())["learner"].keys()
+    again = request.run_config(None, path, config_file(path), {}, None, None)
+    assert again.learner == run.learner
+    path.write_text('{"task": "track", "learner": {"gamma": 0.5}}')
+    part = request.run_config(None, path, config_file(path), {}, None, None)
+    assert (part.learner.gamma, part.learner.policy_gru_size) == (0.5, load_preset("track")["policy_gru_size"])
+
+
+@pytest.mark.parametrize(("split", "fraction"), [(4, 0.0), (1, 0.5)])
+def test_half_of_a_split_is_refused(split: int, fraction: float) -> None:
+    """It would do nothing. The presets that ship have both or neither."""
+    for name in preset_names():
+        Config.preset(name)
+    values = load_preset("default") | {"apg_split": split, "apg_split_fraction": fraction}
+    with pytest.raises(ValidationError, match="expected apg_split above 1 and apg_split_fraction above 0, or neither"):
+        Config.model_validate(values, strict=False)
 
 
 def test_a_file_with_a_former_name_is_noted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,6 +1,7 @@
 """The terminal: an interrupt that Python itself would lose."""
 
 import gc
+import os
 import signal
 import sys
 import time
@@ -60,3 +61,27 @@ def test_other_errors_there_go_to_the_hook_of_before(monkeypatch: pytest.MonkeyP
         gc.collect()
     assert told
     assert all(isinstance(each.exc_value, ZeroDivisionError) for each in told)
+
+
+def test_ctrl_c_asks_to_stop_though_the_reader_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In `| tee log` it ends tee first: what is printed goes nowhere, and the command goes on to save."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr(terminal.console, "quiet", False)
+    with os.fdopen(writer, "w") as gone, terminal.stop_requested() as stopped:
+        monkeypatch.setattr(sys, "stdout", gone)
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()
+        terminal.console.print("saved")
+
+
+def test_ctrl_c_within_a_print_asks_to_stop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python refuses the handler a stream that it has interrupted."""
+
+    def refused(*_: object) -> None:
+        raise RuntimeError("reentrant call")
+
+    monkeypatch.setattr(terminal.console, "print", refused)
+    with terminal.stop_requested() as stopped:
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()

@@ -1,5 +1,6 @@
 """Checkpoints: every damage is detected and named, valid ones are used and kept, others are refused in one line."""
 
+import errno
 import json
 import os
 import shutil
@@ -15,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fault_injection import digest
-from qrl.runs import checkpoint, orbax_files
+from qrl.runs import checkpoint, integrity, orbax_files
 from qrl.runs.checkpoint import Checkpoint, Record
 from qrl.runs.files import Row
 from qrl.runs.integrity import FORMAT, MANIFEST, CorruptCheckpoint, IncompatibleCheckpoint
@@ -156,6 +157,58 @@ def test_the_last_step_valid_for_all_seeds_is_used(tmp_path: Path, run: Path, sa
     (note,) = found.notes
     assert str(other) in note
     assert checkpoint.saved_steps(run) == checkpoint.saved_steps(other) == [1]
+
+
+@pytest.mark.parametrize(
+    ("place", "name"), [(Path, "read_bytes"), (integrity, "_sha256"), (orbax_files, "read_record")]
+)
+def test_a_fault_of_the_disk_is_no_corruption(
+    run: Path, monkeypatch: pytest.MonkeyPatch, place: Any, name: str
+) -> None:
+    """In a manifest, a file, or while Orbax reads. Nothing is changed: the next command may read it."""
+
+    def fail(*_: Any) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    before = digest(run)
+    with monkeypatch.context() as patch:
+        patch.setattr(place, name, fail)
+        with pytest.raises(OSError, match=rf"^{at(run, 3)}.*: cannot be read \(Input/output error\)$") as raised:
+            latest(run)
+    assert not isinstance(raised.value, CorruptCheckpoint)
+    assert digest(run) == before
+    assert_resumes(latest(run), 3)
+
+
+@pytest.mark.parametrize("name", ["checkpoints", "state"])
+def test_a_folder_that_cannot_be_read_is_not_empty(run: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    before = digest(run)
+    with monkeypatch.context() as patch:
+        for inner in (os.listdir, os.scandir):
+
+            def denied(path: Any = ".", inner: Callable[[Any], Any] = inner) -> Any:
+                if Path(path).name == name:
+                    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+                return inner(path)
+
+            patch.setattr(os, inner.__name__, denied)
+        with pytest.raises(PermissionError, match=name):
+            latest(run)
+    assert digest(run) == before
+
+
+def test_a_step_that_was_skipped_is_kept(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Even if a moment later it is as it was written."""
+    before, read = digest(at(run, 3)), checkpoint.read
+
+    def corrupt_once(folder: Path, of: Any, env_steps: int, target: Any) -> Checkpoint:
+        if env_steps == 3:
+            raise CorruptCheckpoint(f"{at(run, 3)}: is corrupt")
+        return read(folder, of, env_steps, target)
+
+    monkeypatch.setattr(checkpoint, "read", corrupt_once)
+    assert_resumes(latest(run), 2)
+    assert digest(run / "checkpoints" / "corrupt-3") == before
 
 
 @pytest.mark.parametrize("first", [True, False])

@@ -3,8 +3,9 @@
 import csv
 import json
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,13 @@ import numpy as np
 import pytest
 
 from cli_helpers import TINY_VALUES, complaint, qrl
+from qrl.cli import sweep
 from qrl.sweep import results, runner
-from qrl.sweep.grid import Grid, Search, load
-from qrl.sweep.runner import Result
+from qrl.sweep.grid import Grid, Search, Space, load
+from qrl.sweep.runner import Chunk, ChunkDone, Result
 from qrl.sweep.search import Proposals, Pruning
+from qrl.training.trainer import Trainer
+from qrl_envs.specfile import BadInput
 from sweep_helpers import chunk_of, rows_of, write_grid
 
 pytestmark = pytest.mark.usefixtures("quick_compilation_of_module")
@@ -169,6 +173,108 @@ def test_an_interrupted_search_goes_on_to_the_same_bits(
     for table in ("results.csv", "curves.csv"):
         assert rows_of(out / table) == rows_of(done / table)
     assert (out / "best.json").read_text() == (done / "best.json").read_text()
+
+
+class Instant:
+    """An engine that trains nothing: what a member comes to is its number."""
+
+    on_cpu, workers, grid_bytes = True, 1, 1e9
+
+    def __init__(self, memory_bytes: float = 1e9) -> None:
+        self.memory_bytes = memory_bytes
+        self.trained: list[int] = []  # the first member of each chunk
+
+    def run(self, chunks: Sequence[Chunk], folder: Path, stopped: Callable[[], bool]) -> Iterator[ChunkDone]:
+        for chunk in chunks:
+            self.trained.append(chunk.index)
+            each = {member.index: Result([report(chunk.steps, -member.index)], "") for member in chunk.members}
+            runner.keep(folder, ChunkDone(chunk.index, each, 0.0))
+            yield ChunkDone(chunk.index, each, 0.0)
+
+    def describe(self) -> str:
+        return "nowhere"
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def excluding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], Path]:
+    """A search of so many steps over two settings, of which 16 and 8 need more than 400, and 128 bytes a member."""
+
+    def bytes_of(trainer: Trainer, _: Any) -> int:
+        return trainer.config.num_envs * trainer.config.warmup_unrolls
+
+    monkeypatch.setattr(runner, "member_bytes", bytes_of)
+    axes = {"num_envs": [4, 16], "warmup_unrolls": [2, 8], "gamma": {"from": 0.5, "to": 0.9}}
+    fixed = {name: value for name, value in TINY_VALUES.items() if name not in axes}
+
+    def write(steps: int) -> Path:
+        search = {"trials": 12, "batch": 3}
+        return write_grid(tmp_path, axes, fixed={**fixed, "num_timesteps": steps}, search=search)
+
+    return write
+
+
+@pytest.mark.parametrize("steps", [400, 4000])
+def test_a_trial_that_cannot_be_trained_fails_alone(
+    excluding: Callable[[int], Path], tmp_path: Path, steps: int
+) -> None:
+    """For want of steps or of memory: Optuna and the tables do without it. A search that goes on, even where there is
+    memory, has the same numbers.
+    """
+    path, out = excluding(steps), tmp_path / "out"
+    grid = load(path, 1e9)
+
+    def search(engine: Instant) -> tuple[sweep.Plan, dict[int, Result]]:
+        plan = sweep.Plan(grid, engine, path)
+        return plan, sweep._train(plan, engine, out / "chunks", lambda: False) or {}
+
+    small, large = Instant(memory_bytes=100.0), Instant()
+    plan, found = search(small)
+    at = [point.coordinates for point in plan.grid.points]
+    lost = {i for i, place in enumerate(at) if (place["num_envs"], place["warmup_unrolls"]) == (16, 8)}
+    assert 0 < len(lost) < 12
+    assert plan._search
+    assert [trial.state.name == "FAIL" for trial in plan._search._study.trials] == [i in lost for i in range(12)]
+    assert sorted(small.trained) == [2 * i for i in range(12) if i not in lost]
+
+    for chunk in sorted((out / "chunks").glob("*.json"))[6:]:
+        chunk.unlink()
+    assert repr(search(small)[1]) == repr(found)
+    assert repr(search(large)[1]) == repr(found)
+    assert not large.trained
+
+    assert sweep._finish(out, plan.grid, found, "grid", 1.0) == 0
+    rows = rows_of(out / "results.csv")[::2]
+    assert [(int(row["point"]), float(row["gamma"])) for row in rows] == [
+        (i, at[i]["gamma"]) for i in range(12) if i not in lost
+    ]
+
+
+def test_where_no_trial_can_be_trained_the_last_says_why(
+    excluding: Callable[[int], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each time."""
+    path, asked = excluding(400), count(1)
+    grid = load(path, 1e9)
+
+    def refuse(self: Space, values: Any) -> None:
+        raise BadInput(f"no {next(asked)}")
+
+    monkeypatch.setattr(Space, "point", refuse)
+    for _ in range(2):
+        plan = sweep.Plan(grid, Instant(), path)
+        with pytest.raises(BadInput, match=r"^no 12$"):
+            sweep._train(plan, Instant(), tmp_path / "chunks", lambda: False)
+
+
+def test_a_success_that_is_not_measured_is_no_goal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = searched(tmp_path, maximize="success")
+    sweep.Plan(load(path, 1e9), Instant(), path)
+    fast = {"task": "fast", "fixed": {**FIXED, "episode_length": 20}, "search": {"trials": 2, "maximize": "success"}}
+    said = complaint(capsys, "sweep", write_grid(tmp_path, {"gamma": [0.8, 0.9]}, **fast), "--out", tmp_path / "out")
+    assert "grid.json: key 'search.maximize': expected return_mean, for task 'fast' measures no success" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_search_needs_optuna(

@@ -1,6 +1,7 @@
 """A sweep's members are single runs: the same bits, whoever ran beside them, however often it was interrupted."""
 
 import csv
+import errno
 import json
 import os
 import signal
@@ -260,6 +261,19 @@ def test_a_plot_that_fails_costs_no_result(three_points: Any, tmp_path: Path, mo
     with pytest.raises(OSError, match="no fonts"):
         sweep._finish(tmp_path, three_points, {i: result(1.0) for i in range(12)}, "grid", 1.0)
     assert all((tmp_path / name).exists() for name in ("results.csv", "curves.csv", "summary.json", "best.json"))
+
+
+def test_half_a_picture_is_none(three_points: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk that is full while it is drawn is named with it, and the next command draws it."""
+
+    def half(path: Path, *_: Any) -> None:
+        path.write_bytes(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(plot, "sweep", half)
+    with pytest.raises(OSError, match=rf"{tmp_path}/sweep.png: cannot be written \(No space left on device\)"):
+        sweep._finish(tmp_path, three_points, {i: result(1.0) for i in range(12)}, "grid", 1.0)
+    assert not list(tmp_path.glob("sweep.png*"))
 
 
 def test_a_folder_of_something_else_is_refused(done: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,8 +29,10 @@ def identify(args: argparse.Namespace) -> int:
     vehicle = specfile.build(Vehicle, with_default_scale(start), args.vehicle)
     share, others = _hold_out(args.hold_out)
     paths = [*args.logs, *others]
-    if double := [path for i, path in enumerate(paths) if path in paths[:i]]:
+    places = [path.resolve() for path in paths]
+    if double := [path for i, path in enumerate(paths) if places[i] in places[:i]]:
         raise BadInput(f"{double[0]}: stands twice among the logs")
+    beside, picture = _outputs(args, {*places, Path(args.vehicle).resolve()})
     logs = flight_log.read(paths, np.array([motor.max_N for motor in vehicle.motors]))
     fitted_to, unseen, apart = _split(logs, vehicle, len(args.logs), share)
     for log in logs:
@@ -54,16 +56,26 @@ def identify(args: argparse.Namespace) -> int:
     )
     summary = report.summary(found)
     _tell(free, fit, rows, summary)
-    picture = args.plot or args.out.with_suffix(".png")
     files.write_json(args.out, data)
     details: dict[str, Any] = {"held_out": {**summary, "of": apart}, "intervals": "sandwich, by segments"}
     details |= {"explained": fit.explained, "parameters": [row._asdict() for row in rows]}
-    beside = args.out.with_name(f"{args.out.stem}_report.json")
     files.write_json(beside, details)
     with files.writing(picture):
         plot.draw(picture, f"{args.out.name}: {plural(len(logs), 'flight')}, starting from {args.vehicle}", rows, found)
     console.print(f"{args.out}, {beside}, {picture}")
     return DONE
+
+
+def _outputs(args: argparse.Namespace, taken: set[Path]) -> tuple[Path, Path]:
+    """Names of the report and the picture; BadInput unless they and OUT are files of their own, not `taken`."""
+    files.check_output(args.out, "--out")
+    beside, picture = args.out.with_name(f"{args.out.stem}_report.json"), args.plot or args.out.with_suffix(".png")
+    for path, flag in ((args.out, "--out"), (beside, "--out"), (picture, "--plot" if args.plot else "--out")):
+        files.check_output(path, flag)
+        if path.resolve() in taken:
+            raise BadInput(f"{flag}: {path} is read, or written too: expected another name")
+        taken.add(path.resolve())
+    return beside, picture
 
 
 def _hold_out(words: list[str]) -> tuple[float, list[Path]]:

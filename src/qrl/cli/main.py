@@ -72,10 +72,10 @@ def _main(argv: list[str] | None) -> int:
     _note_former_names(getattr(args, "config", None) or getattr(args, "grid", None))
     try:
         configure_jax()
-    except KeyboardInterrupt:
+        return _run(args)
+    except KeyboardInterrupt:  # in an import
         print_error("interrupted")
         return FAILED
-    return _run(args)
 
 
 def _note_former_names(path: Path | None) -> None:

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 
 from qrl import tasks
+from qrl.algorithm.flights import FlightPlan
 from qrl.cli.terminal import DONE, FAILED, clock, console, plural, print_error, progress_bar, stop_requested
 from qrl.runs import files, record
 from qrl.sweep import grid as grids
@@ -106,10 +107,20 @@ class Plan:
         for indices in grid.groups():
             self._program(grid.points[indices[0]], len(indices))
         search = grid.file.search
+        if search and search.maximize == "success":
+            self._check_success(grid.points[0])
         self._search = Proposals(search, grid.space.axes) if search and grid.space else None
         self._points = [] if self._search else grid.points
         self._batch: range | None = None  # points of the batch under way
         self._trials = search.trials if search else len(grid.points)
+
+    def _check_success(self, point: GridPoint) -> None:
+        """BadInput if success is not measured: every trial would be as bad as the others."""
+        if FlightPlan.of(tasks.environment(point.task), 1).measure is None:
+            raise BadInput(
+                f"{self._path}: key 'search.maximize': expected return_mean, for task '{point.task.name}' measures no"
+                " success"
+            )
 
     @property
     def grid(self) -> Grid:
@@ -129,8 +140,11 @@ class Plan:
         programs = "" if self._search else f" in {plural(self.programs, 'compiled program')}"
         return f"{what} × {plural(len(self._given.seeds), 'seed')} = {plural(self.members, 'member')}{programs}"
 
-    def next_batch(self, found: dict[int, Result]) -> list[Chunk] | None:
-        """The chunks of the next batch, without the members that have a result; None if there is no next."""
+    def next_batch(self, found: dict[int, Result], failed: Callable[[ChunkDone], None]) -> list[Chunk] | None:
+        """The chunks of the next batch, without the members that have a result; None if there is no next.
+
+        `failed` is to record a trial that cannot be trained, as results without reports. BadInput if none can.
+        """
         if not self._search:
             if self._batch is not None:
                 return None
@@ -141,12 +155,12 @@ class Plan:
             self._search.tell(
                 results, [self.grid.pruned(i, seeds) for i, seeds in zip(self._batch, results, strict=True)]
             )
-        assert self._given.space
-        points = [self._given.space.point(values) for values in self._search.ask()]
-        self._batch = range(len(self._points), len(self._points) + len(points))
-        self._points = self._points + points
-        chunks = [self._trial(i) for i in self._batch if not found.keys() >= {*self._members(i)}]
-        return sorted(chunks, key=lambda chunk: chunk.program) if points else None
+        asked, first = self._search.ask(), len(self._points)
+        if not asked and not any(result.rows for result in found.values()):
+            raise BadInput(found[self.members - 1].diverged)
+        chunks = [chunk for values in asked for chunk in self._proposed(values, found, failed)]
+        self._batch = range(first, len(self._points))
+        return sorted(chunks, key=lambda chunk: chunk.program) if asked else None
 
     def complete(self, found: dict[int, Result]) -> bool:
         """Whether all members of the batch under way have a result."""
@@ -164,6 +178,26 @@ class Plan:
             return []
         size = self._size(len(members), program.member_bytes)
         return [program.chunk(members[i : i + size], size) for i in range(0, len(members), size)]
+
+    def _proposed(
+        self, values: list[Any], found: dict[int, Result], failed: Callable[[ChunkDone], None]
+    ) -> list[Chunk]:
+        """Make a proposal the next point, and of it a chunk where it has no result yet and can be trained."""
+        space, number = self._given.space, len(self._points)
+        assert space
+        known = found.get(self._members(number)[0])
+        at = {axis.name: value for axis, value in zip(space.axes, values, strict=True)}
+        self._points.append(replace(self._given.points[0], coordinates=at))  # stands for one that cannot be
+        try:
+            self._points[number] = space.point(values)
+            return [] if known else [self._trial(number)]
+        except BadInput as error:
+            if known and known.rows:
+                raise
+            if not known:  # recorded, since it may be the memory of this machine that it does not fit into
+                lost = Result([], str(error))
+                failed(ChunkDone(self._members(number)[0], dict.fromkeys(self._members(number), lost), 0.0))
+            return []
 
     def _trial(self, point: int) -> Chunk:
         """All seeds of a trial, which is judged by them all."""
@@ -204,9 +238,14 @@ def _train(plan: Plan, engine: runner.Engine, folder: Path, stopped: Callable[[]
     found = runner.finished(
         folder, lambda path: console.print(f"{path}: cannot be read; its members are trained again")
     )
+
+    def failed(trial: ChunkDone) -> None:
+        runner.keep(folder, trial)
+        console.print(f"a trial failed: {trial.results[trial.chunk].diverged}")
+
     total, before, start_time = plan.members, None, time.perf_counter()
     with progress_bar(total, 0) as update:
-        while (chunks := plan.next_batch(found)) is not None:
+        while (chunks := plan.next_batch(found, failed)) is not None:
             of = {chunk.index: chunk for chunk in chunks}
             count = len(plan.grid.points) * len(plan.grid.seeds) - sum(len(chunk.members) for chunk in chunks)
             before = count if before is None or not chunks else before
@@ -241,11 +280,13 @@ def _train(plan: Plan, engine: runner.Engine, folder: Path, stopped: Callable[[]
 
 
 def _finish(out: Path, grid: Grid, found: dict[int, Any], name: str, seconds: float) -> int:
+    found = {index: result for index, result in found.items() if result.rows}  # without trials that failed
     summaries = results.summaries(grid, found)
     results.write(out, grid, found, summaries, seconds)
     _print_table(grid, summaries)
     of = ", ".join(dict.fromkeys(point.asked or point.task.name for point in grid.points))
-    plot.sweep(out / "sweep.png", summaries, f"{name}: {of}, {len(grid.seeds)} seeds")
+    with files.replacing(out / "sweep.png") as picture:
+        plot.sweep(picture, summaries, f"{name}: {of}, {len(grid.seeds)} seeds")
     code = _exit_code(out)
     if code == DONE:
         best = ", ".join(str(path) for path in sorted(out.glob("best*.json")))

@@ -6,7 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.console import Console
@@ -14,7 +14,16 @@ from rich.console import Console
 DONE, FAILED, WRONG_INPUT = 0, 1, 2
 STARTED = time.time() - 5.0  # s since the epoch: no module was read before
 
-console = Console(highlight=False, markup=False, soft_wrap=True)
+
+class _Console(Console):
+    """rich's, which would exit the command where whoever reads its output is gone, as `tee` is after a Ctrl-C."""
+
+    def on_broken_pipe(self) -> None:
+        with suppress(SystemExit):
+            super().on_broken_pipe()  # quiet from now on
+
+
+console = _Console(highlight=False, markup=False, soft_wrap=True)
 
 
 def print_error(message: str) -> None:
@@ -42,7 +51,8 @@ def stop_requested(message: str = "stopping: saving first") -> Iterator[Callable
         if requested and number == signal.SIGINT:
             raise KeyboardInterrupt
         requested = True
-        console.print(message)
+        with suppress(Exception):  # the terminal may be gone, or be written to just now
+            console.print(message)
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:

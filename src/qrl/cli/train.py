@@ -133,6 +133,12 @@ def make_plan(args: argparse.Namespace, stack: ExitStack) -> Plan | None:
         initial.check(first, config, env)
     tasks.check(env, config.learner, where)
     devices.check_devices(config)
+    if (share := config.learner.apg_fraction) and not config.learner.num_apg_updates:
+        least = config.learner.unrolls_per_apg_update * config.learner.steps_per_unroll
+        print_error(
+            f"warning: apg_fraction {share:g}: no update of APG, which takes {least:,} steps, fits into that share of"
+            f" {config.learner.num_timesteps:,}"
+        )
     out.mkdir(parents=True, exist_ok=True)
     stack.enter_context(files.locked(out / "lock", f"{out}: in use by another process"))
     if exists != (out / "config.json").exists():

@@ -35,6 +35,8 @@ def view(args: argparse.Namespace) -> int:
     folders = record.member_folders(args.run, config)
     if args.out and len(folders) > 1:
         raise BadInput(f"{args.run}: --out: holds {config.seeds} seeds; name one of them, such as {folders[0]}")
+    if args.out:
+        files.check_output(args.out, "--out")
     requested = _requested(args.starts) if args.starts else None
     task = tasks.spec(config.task)
     programs = FlightPrograms(tasks.environment(config.task), config.learner)

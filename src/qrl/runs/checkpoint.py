@@ -8,6 +8,7 @@ import errno
 import os
 import shutil
 import time
+from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -47,7 +48,8 @@ def read(folder: Path, run: RunConfig, env_steps: int, target: Any, *, part: boo
     """The checkpoint of `run` at `env_steps`; `target` has structure, shapes and types of a member's state.
 
     With `part`, fields of `target` that are None are neither read nor compared. Raises CorruptCheckpoint if a file is
-    not as it was written, IncompatibleCheckpoint if the checkpoint is of another run or version of qrl.
+    not as it was written, IncompatibleCheckpoint if the checkpoint is of another run or version of qrl, another
+    OSError if it cannot be read for now.
     """
     from qrl.runs import orbax_files
 
@@ -65,7 +67,7 @@ def read(folder: Path, run: RunConfig, env_steps: int, target: Any, *, part: boo
     except (CorruptCheckpoint, IncompatibleCheckpoint):
         raise
     except OSError as error:
-        raise CorruptCheckpoint(f"{path}: cannot be read ({first_line(error)})") from None
+        raise OSError(f"{path}: cannot be read ({first_line(error)})") from None
     except (ValueError, KeyError, TypeError) as error:
         raise IncompatibleCheckpoint(f"{path}: of another version of qrl ({first_line(error)})") from None
     for name, leaf in leaves.items():  # Orbax ignores both for NumPy arrays
@@ -83,20 +85,29 @@ def _by_name(tree: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): x for path, x in jax.tree.leaves_with_path(tree)}
 
 
-def discard_after(folder: Path, env_steps: int) -> None:
-    """Remove the checkpoints after `env_steps`; those that fail verification are renamed to corrupt-STEP instead."""
-    for path in _steps(folder):
-        if int(path.name) <= env_steps:
-            continue
-        try:
-            if integrity.has_manifest(path):
-                integrity.verify(path)
-                integrity.remove_manifest(path)  # first: no half-removed checkpoint may count as complete
-            shutil.rmtree(path)
-        except (CorruptCheckpoint, IncompatibleCheckpoint):
+def discard_after(folder: Path, env_steps: int, corrupt: Collection[int] = ()) -> None:
+    """Remove the checkpoints after `env_steps`; those of the steps `corrupt`, and others that fail verification, are
+    renamed to corrupt-STEP instead. OSError, with nothing changed, if one cannot be read.
+    """
+    later = [path for path in _steps(folder) if int(path.name) > env_steps]
+    kept = [path for path in later if int(path.name) in corrupt or not _removable(path)]
+    for path in later:
+        if path in kept:
             quarantine = path.with_name(f"corrupt-{path.name}")
             shutil.rmtree(quarantine, ignore_errors=True)
             path.rename(quarantine)
+        else:
+            integrity.remove_manifest(path)  # first: no half-removed checkpoint may count as complete
+            shutil.rmtree(path)
+
+
+def _removable(path: Path) -> bool:
+    """Whether a checkpoint is as it was written, or was never completed."""
+    with suppress(CorruptCheckpoint, IncompatibleCheckpoint):
+        if integrity.has_manifest(path):
+            integrity.verify(path)
+        return True
+    return False
 
 
 class Writer:
@@ -180,4 +191,5 @@ def _root(folder: Path) -> Path:
 
 
 def _steps(folder: Path) -> list[Path]:
-    return [path for path in _root(folder).glob("*") if path.name.isdecimal() and path.is_dir()]
+    root = _root(folder)  # not by glob, which finds nothing where it may not read
+    return [path for path in root.iterdir() if path.name.isdecimal() and path.is_dir()] if root.exists() else []

@@ -22,13 +22,19 @@ def write_json(path: Path, data: Any) -> None:
 
 def replace_text(path: Path, text: str) -> None:
     """Write a file atomically: to a temporary name, then renamed. OSError names `path`."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())  # before the name: after a crash it must not point to missing data
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """The temporary name of what, once it is whole, is called `path`. OSError names `path`."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")  # one for each process
     with writing(path):
         try:
-            with temporary.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())  # before the name: after a crash it must not point to missing data
+            yield temporary
             temporary.replace(path)
         except OSError:
             temporary.unlink(missing_ok=True)
@@ -42,6 +48,14 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OSError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def check_output(path: Path, flag: str) -> None:
+    """BadInput, which names the flag, unless a file can be written at `path`: before the work that it is for."""
+    if path.is_dir():
+        raise BadInput(f"{flag}: expected the name of a file, found the folder {path}")
+    if not (path.parent.is_dir() and os.access(path.parent, os.W_OK)):
+        raise BadInput(f"{flag}: expected a file in a folder that is there and can be written to, found {path}")
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -39,14 +39,18 @@ def remove_manifest(path: Path) -> None:
 
 
 def verify(path: Path) -> None:
-    """Raise CorruptCheckpoint if a file differs from its digest, IncompatibleCheckpoint if the format is not FORMAT."""
+    """Raise CorruptCheckpoint if a file is missing or differs from its digest, IncompatibleCheckpoint if the format is
+    not FORMAT, another OSError if a file cannot be read for now.
+    """
     manifest = path / MANIFEST
     if not manifest.exists() and (path / _FORMER_MANIFEST).exists():
         raise IncompatibleCheckpoint(f"{path}: written by an earlier version of qrl, which this one cannot resume")
     try:
         data = json.loads(manifest.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+    except (FileNotFoundError, IsADirectoryError, ValueError, RecursionError) as error:
         raise CorruptCheckpoint(f"{manifest}: cannot be read ({first_line(error)})") from None
+    except OSError as error:
+        raise OSError(f"{manifest}: cannot be read ({first_line(error)})") from None
     version, digests = (data.get("format"), data.get("sha256")) if isinstance(data, dict) else (None, None)
     if isinstance(version, int) and version != FORMAT:
         when = "a later" if version > FORMAT else "an earlier"
@@ -62,7 +66,7 @@ def verify(path: Path) -> None:
         try:
             actual = _sha256(path / name)
         except OSError as error:
-            raise CorruptCheckpoint(f"{path}/{name}: cannot be read ({first_line(error)})") from None
+            raise OSError(f"{path}/{name}: cannot be read ({first_line(error)})") from None
         if actual != digest:
             raise CorruptCheckpoint(f"{path}/{name}: is corrupt")
 
@@ -73,7 +77,11 @@ def first_line(error: Exception) -> str:
 
 
 def _files(path: Path) -> list[str]:
-    return sorted(str(file.relative_to(path)) for file in path.rglob("*") if file.is_file() and file.name != MANIFEST)
+    def fail(error: OSError) -> None:  # os.walk would pass over a folder that cannot be read
+        raise error
+
+    inside = [Path(folder, name) for folder, _, names in os.walk(path, onerror=fail) for name in names]
+    return sorted(str(file.relative_to(path)) for file in inside if file.is_file() and file.name != MANIFEST)
 
 
 def _sha256(path: Path) -> str:

@@ -3,8 +3,9 @@
 import hashlib
 import shutil
 import tempfile
-from contextlib import suppress
 from pathlib import Path
+
+from qrl.runs.files import writing
 
 SHIPPED = Path(__file__).parents[1] / "policies"
 COPIES = Path("runs") / "shipped"
@@ -26,8 +27,13 @@ def run_folder(run: Path) -> Path:
     if copy.is_dir():
         return copy
     COPIES.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=COPIES, prefix=".copy-") as work, suppress(OSError):
-        shutil.copytree(source, Path(work) / run.name).rename(copy)  # unless another process was first
+    with writing(copy), tempfile.TemporaryDirectory(dir=COPIES, prefix=".copy-") as work:
+        made = shutil.copytree(source, Path(work) / run.name)
+        try:
+            made.rename(copy)
+        except OSError:
+            if not copy.is_dir():  # else another process was first
+                raise
     return copy
 
 

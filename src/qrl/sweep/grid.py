@@ -167,7 +167,7 @@ class Grid:
         """Whether a point's training was ended before its last step; `results`: of its seeds, with `rows`."""
         learner = self.points[point].learner
         steps = learner.num_unrolls * learner.steps_per_unroll
-        return any(result.rows[-1]["env_steps"] < steps for result in results)
+        return any(row["env_steps"] < steps for result in results for row in result.rows[-1:])
 
     def groups(self) -> list[list[int]]:
         groups: dict[str, list[int]] = {}

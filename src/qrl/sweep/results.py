@@ -56,10 +56,10 @@ def _cell(value: Any) -> Any:
 
 
 def summaries(grid: Grid, results: dict[int, Result]) -> list[Summary]:
-    """For each point the quartiles over its seeds; a seed that diverged counts as the worst possible."""
+    """For each point with results the quartiles over its seeds; a seed that diverged counts as the worst possible."""
     measured = any(math.isfinite(row["success"]) for result in results.values() for row in result.rows[-1:])
     found = []
-    for i, point in enumerate(grid.points):
+    for i in sorted({index // len(grid.seeds) for index in results}):
         seeds = [results[i * len(grid.seeds) + j] for j in range(len(grid.seeds))]
         numbers = {
             name: _quartiles([_worst(name, measured) if seed.diverged else seed.rows[-1][name] for seed in seeds])
@@ -68,7 +68,7 @@ def summaries(grid: Grid, results: dict[int, Result]) -> list[Summary]:
         }
         num_diverged = sum(bool(seed.diverged) for seed in seeds)
         about = {"seeds": len(seeds), "diverged": num_diverged, **_pruned(grid, i, seeds)}
-        found.append({"point": i, "at": point.coordinates, **about, **numbers})
+        found.append({"point": i, "at": grid.points[i].coordinates, **about, **numbers})
     return found
 
 

@@ -83,16 +83,21 @@ class Proposals:
         return Pruning(self._search.maximize, self._curves) if self._search.prune else None
 
     def tell(self, results: Sequence[Sequence[tuple[list[Row], str]]], pruned: Sequence[bool]) -> None:
-        """Results of this batch: of each trial each seed's reports, and what diverged; and whether it was pruned."""
+        """Results of this batch: of each trial each seed's reports, and what diverged; and whether it was pruned.
+
+        One without reports could not be trained: it failed.
+        """
         curves = [self._curve(seeds) for seeds in results]
         for trial, curve, early in zip(self._asked, curves, pruned, strict=True):
             for step, value in curve.items():
                 trial.report(value, step)
-            if early:
-                self._study.tell(trial, state=self._optuna.trial.TrialState.PRUNED)
+            if early or not curve:
+                states = self._optuna.trial.TrialState
+                self._study.tell(trial, state=states.PRUNED if curve else states.FAIL)
             else:
                 self._study.tell(trial, list(curve.values())[-1])
-        self._curves = self._curves + [curve for curve, early in zip(curves, pruned, strict=True) if not early]
+        whole = [curve for curve, early in zip(curves, pruned, strict=True) if curve and not early]
+        self._curves = self._curves + whole
 
     def _curve(self, seeds: Sequence[tuple[list[Row], str]]) -> Curve:
         reports = zip(*(rows for rows, _ in seeds), strict=True)

@@ -36,22 +36,27 @@ def restore_common(folders: list[Path], configs: list[RunConfig], target: TrainS
     """The last checkpoint that is valid in every member's folder; `target`: shapes and types of all their states.
 
     Corrupt checkpoints are quarantined; later or unfinished ones are deleted: the run makes them again. Raises
-    IncompatibleCheckpoint, with nothing changed, if a checkpoint belongs to another run or version of qrl.
+    IncompatibleCheckpoint, with nothing changed, if a checkpoint belongs to another run or version of qrl, another
+    OSError if one cannot be read for now.
     """
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), target)
-    notes = []
+    notes: list[str] = []
+    corrupt: dict[Path, set[int]] = {folder: set() for folder in folders}
     common = set.intersection(*[set(checkpoint.saved_steps(folder)) for folder in folders])
     for env_steps in sorted(common, reverse=True):
-        try:
-            found = [checkpoint.read(*member, env_steps, one) for member in zip(folders, configs, strict=True)]
-        except CorruptCheckpoint as error:
-            notes.append(str(error))
-            continue
-        break
+        found = []
+        for folder, run in zip(folders, configs, strict=True):
+            try:
+                found.append(checkpoint.read(folder, run, env_steps, one))
+            except CorruptCheckpoint as error:
+                notes.append(str(error))
+                corrupt[folder].add(env_steps)
+        if len(found) == len(folders):
+            break
     else:
         env_steps, found = 0, []
     for folder in folders:
-        checkpoint.discard_after(folder, env_steps)
+        checkpoint.discard_after(folder, env_steps, corrupt[folder])
     where = f"resuming from step {env_steps:,}" if env_steps else "no valid checkpoint; starting from scratch"
     notes = [f"{note}; {where}" for note in notes]
     states = stack([each.state for each in found]) if found else None
