@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Every command end to end on a CPU, with tiny budgets: `make smoke`.
 #
-# It proves the contracts of the command line (DESIGN.md, Sec. 3), so it stands with the other proofs; it is not a
+# It proves the contracts of the command line, so it stands with the other proofs; it is not a
 # pytest because it goes the user's way: through make, a process for each command, and signals.
 # What was trained is thrown away. Usage: tests/smoke.sh
 set -euo pipefail
@@ -57,7 +57,7 @@ refuses() {
   grep -qE -e "$2" "$log/stderr" || fail "$1: the line does not match /$2/"
 }
 
-# The run folder "$1" holds all that DESIGN.md says it does.
+# The run folder "$1" holds all that it should.
 complete() {
   "$python" - "$1" >"$log/stdout" 2>"$log/stderr" <<'PYTHON' || fail "the run folder $1 is not complete"
 import csv, json, math, sys

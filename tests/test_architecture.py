@@ -1,7 +1,7 @@
 """Imports go through the doors that are there: experiments -> qrl -> qrl_envs, and inside each from room to room.
 
-`ROOMS` is the table of DESIGN.md, Sec. 1: for each room of the house the rooms and libraries that it may import. Read
-from the source, so an import inside a function counts like any other. Every rule is seen failing (`BROKEN`).
+`ROOMS` is the table of docs/architecture.md: for each room the rooms and libraries that it may import. Read from the
+source, so an import inside a function counts like any other. Every rule is seen failing (`BROKEN`).
 """
 
 import ast
