@@ -135,6 +135,13 @@ def assert_close(ours: TrainState, expected: TrainState) -> None:
             np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5, err_msg=name)
 
 
+def whenever_drawn(states: TrainState) -> TrainState:
+    """`states` without what says how early each lane's next start was drawn, which members at once decide together."""
+    lanes = states.lanes
+    started = lanes.reset_count + lanes.next_state_used
+    return states._replace(lanes=lanes._replace(next_state=(), reset_count=started, next_state_used=None))  # pyright: ignore[reportArgumentType]
+
+
 def test_members_at_once_are_those_one_after_the_other(
     pair: tuple[list[Chunk], TrainState], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -142,7 +149,7 @@ def test_members_at_once_are_those_one_after_the_other(
     monkeypatch.setattr("qrl.training.sharding.sequential_members", lambda count: count == 1)
     made, states = chunks([CRASHES, FLIES], make_trainer(ENV, CONFIG))
     assert [chunk.extended for chunk in made if chunk.extended] == [c.extended for c in pair[0] if c.extended]
-    assert_close(states, pair[1])
+    assert_close(whenever_drawn(states), whenever_drawn(pair[1]))
 
 
 @pytest.mark.parametrize("at", [11, 12, 13, 24])
