@@ -20,6 +20,7 @@ STRICT = ("-std=c99", "-pedantic", *WARNINGS)
 HOOK = """
 #include "{name}_hook.c"
 unsigned size(void) {{ return (unsigned)sizeof({name}_hook); }}
+float command_of(float of_most) {{ return command(of_most); }}
 """
 # What Indiflight's main loop and its other tasks do, as far as its neural controller sees it.
 INDIFLIGHT = """
@@ -102,11 +103,13 @@ def _gcc(*words: str) -> None:
 class Hook:
     """The hook that an export left in `folder`, compiled in `out`; the calls of any number of vehicles."""
 
-    def __init__(self, folder: Path, name: str, out: Path, *mutants: Mutant) -> None:
+    def __init__(self, folder: Path, name: str, out: Path, *mutants: Mutant, flags: Sequence[str] = ()) -> None:
         out.mkdir(parents=True)
         (out / f"{name}_hook.c").write_text(mutated((folder / f"{name}_hook.c").read_text(), mutants))
         (out / "shim.c").write_text(HOOK.format(name=name))
-        self.c, self._name = compiled(out / "shim.c", folder, name, () if mutants else STRICT), name
+        flags = [*(() if mutants else STRICT), *flags]
+        self.c, self._name = compiled(out / "shim.c", folder, name, flags), name
+        self.c.command_of.restype = ctypes.c_float
         self.hooks: list[ctypes.Array[ctypes.c_char]] = []
 
     def boot(self) -> int:
@@ -124,6 +127,10 @@ class Hook:
         call = self.c[f"{self._name}_hook_run"]
         who = call(self.hooks[vehicle], ctypes.byref(estimate), ctypes.byref(to), ctypes.c_uint32(now_us), motor)
         return who, np.array(motor)
+
+    def command(self, of_most: float) -> float:
+        """Of an action as a fraction of its greatest."""
+        return self.c.command_of(ctypes.c_float(of_most))
 
     def quaternion(self, roll_rad: float, pitch_rad: float, yaw_rad: float) -> Floats:
         found = (ctypes.c_float * 4)()
@@ -214,7 +221,7 @@ def mistakes(name: str) -> dict[str, list[Mutant]]:
         "heading ignored": [(HEADING(TURN), "{1.0f, 0.0f}")],
         "heading the other way": [(HEADING(TURN), HEADING(f"-{TURN}"))],
         "heading in degrees": [(HEADING(TURN), HEADING(f"0.01745f * {TURN}"))],
-        "thrust as speed": [("share = c < 1.0f", "share = c > 1.0f")],
+        "thrust as speed": [("share = 2.0f * thrust / (c + root)", "share = thrust")],
         "every call": [(f"hook->next_us += {period}", "hook->next_us += 0"), (f"now_us + {period}", "now_us")],
     }
     for i in range(4):

@@ -42,7 +42,7 @@ HEADERS += " src/utils/interface/lighthouse vendor/FreeRTOS/include vendor/FreeR
 SOURCES = "controller/controller_pid controller/attitude_pid_controller controller/position_controller_pid"
 STOCK = [f"src/modules/src/{name}.c" for name in (*SOURCES.split(), "power_distribution_quadrotor")]
 STOCK += [f"src/utils/src/{name}.c" for name in ("pid", "filter", "num")]
-HAND_OVER = "stock given what is not finite"  # of `faulty.of_control`: shown by a flight
+HAND_OVER = "stock given a state that is not finite"  # of `faulty.of_control`: shown by a flight
 CONFIG = {  # what Kconfig makes of the app's configuration, of what these sources ask for
     "cf2_defconfig": ("CONFIG_PLATFORM_CF2 1",),
     "cf21bl_defconfig": (
@@ -50,7 +50,7 @@ CONFIG = {  # what Kconfig makes of the app's configuration, of what these sourc
         "CONFIG_THRUST_BAT_COMPENSATION_MAX_THRUST 200",
     ),
 }
-WHATS = ("disarmed", "NaN for 5 ms", "state frozen")
+WHATS = ("disarmed", "NaN for 5 ms", "set-point NaN for 5 ms", "state frozen")
 FELL_M, SAME_MM, TAIL_MS = 3.0, 1.0, 1000
 
 
@@ -149,6 +149,8 @@ def hand_over(world: World, library: Path, n: int, whats: Sequence[str] = WHATS)
                     app.arm(False)
             elif what == "NaN for 5 ms" and 2000 <= step < 2005:
                 state = np.where(np.arange(13) < 6, np.nan, state)
+            elif what == "set-point NaN for 5 ms" and 2000 <= step < 2005:
+                now = now._replace(position_m=np.full(3, np.nan))
             elif what == "state frozen" and 2000 <= step < 2060:
                 state = frozen.setdefault("state", state)
             return ordered(step, state, now)

@@ -72,7 +72,9 @@ def of_control(NAME: str) -> Mistakes:
         ),
         "status 2 ignored": one("if (status == 2)", "if (0)"),
         "any quaternion": one("square > 0.9f && square < 1.1f", "true"),
-        "stock given what is not finite": one("= fault == STOCK_NOT_FINITE &&", "= false &&"),
+        "stock given a state that is not finite": one("&last_sensors, &last_state, step", "sensors, state, step"),
+        "stock given a set-point that is not finite": one("control, &last_setpoint,", "control, setpoint,"),
+        "a set-point is to have what it does not ask for": one("(!place || ", "("),
         "faults forgotten": one("if (fault != STOCK_UNARMED)", "if (0)"),
         "stock output mixed": one(STOCK, "controllerPid(control, setpoint, sensors, state, step);"),
     }

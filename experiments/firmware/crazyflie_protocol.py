@@ -16,7 +16,7 @@ UNARMED, SETPOINT, SETPOINT_OLD, STATE_OLD, NOT_FINITE = 0, 2, 3, 4, 5
 CURVES = {0.12: -0.1041, 0.2: -0.0339}  # c of the rotors' thrust by THRUST_MAX [N]: crazyflow's cf2x_L250, cf21B_500
 LEAST_N = {0.12: 0.01281758, 0.2: 0.02136263}  # THRUST_MIN
 TOLERANCE = 0.004  # of a force: a step or two of the integer network's inputs, which float rounding may move
-KIND, AGE = 30, 31  # places in `App.tick`'s numbers
+PLACE, VELOCITY, YAW, KIND, AGE = 13, 16, 25, 30, 31  # of the set-point, in `App.tick`'s numbers
 MOVING = Reference(*np.array([[0.3, -0.2, 0.5], [0.4, 0.2, -0.1], [0.8, -0.6, 0.4], [1.0, 2.0, -1.5]]), yaw_deg=35.0)
 
 
@@ -183,7 +183,8 @@ def not_finite(app: App, policy: Policy, kernel: Kernel) -> Iterator[str]:
     anew, and kept from the stock controller. Of the set-point, when the policy runs.
     """
     rows = iter(numbers(states(200, 10), MOVING))
-    bad = [(i, value) for i in range(14) for value in (np.nan, np.inf)] + [(slice(6, 10), 0.0), (slice(6, 10), 3.0)]
+    numbered = (*range(13), PLACE, VELOCITY, YAW)
+    bad = [(i, value) for i in numbered for value in (np.nan, np.inf)] + [(slice(6, 10), 0.0), (slice(6, 10), 3.0)]
     for place, value in bad:
         app.arm(False)
         app.tick(next(rows))
@@ -195,4 +196,23 @@ def not_finite(app: App, policy: Policy, kernel: Kernel) -> Iterator[str]:
             yield f"number {place} = {value}: states {found[0][4]}, {found[1][4]}"
 
 
-CASES = (orders, takes_over, stock, set_points, full_state, old_state, not_finite)
+def kept_from_stock(app: App, policy: Policy, kernel: Kernel) -> Iterator[str]:
+    """Whatever the stock controller flies for, it is given no number that is not finite, of the state or asked for."""
+    rows = iter(numbers(states(200, 11), MOVING))
+    for arm, kind, age, wanted in ((False, 1, 0, UNARMED), (True, 3, 0, SETPOINT), (True, 1, 260, SETPOINT_OLD)):
+        app.arm(arm)
+        for place in (*range(13), PLACE if kind == 1 else VELOCITY, YAW):
+            good, bad = next(rows), next(rows)
+            good[[KIND, AGE]] = bad[[KIND, AGE]] = kind, age
+            bad[place] = np.nan
+            found = app.tick(good), app.tick(bad)
+            if any(tick[4] != wanted or (app.simple_stock and not tick[0]) for tick in found):
+                yield f"number {place} is NaN: state {found[1][4]}, expected {wanted}, motors {found[1][:4]}"
+    slow, fast = next(rows), next(rows)
+    slow[KIND] = fast[KIND] = 3
+    fast[[PLACE, VELOCITY]] = np.nan, 0.9
+    if app.simple_stock and app.tick(slow)[0] == app.tick(fast)[0]:
+        yield "a velocity without a place is not followed"
+
+
+CASES = (orders, takes_over, stock, set_points, full_state, old_state, not_finite, kept_from_stock)

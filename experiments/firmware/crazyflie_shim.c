@@ -43,12 +43,15 @@ bool controllerPidTest(void) {
 
 void controllerPid(control_t *control, const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state,
                    const stabilizerStep_t step) {
-    const float sum = state->position.x + state->velocity.y + state->attitudeQuaternion.w + sensors->gyro.z;
+    const float of_state = state->position.x + state->velocity.y + state->attitudeQuaternion.w + sensors->gyro.z;
+    const float asked = setpoint->mode.z == modeAbs ? setpoint->position.x : setpoint->velocity.x;
     control->controlMode = controlModeLegacy;
     if (step % 2 == 0) {
         control->roll = control->pitch = control->yaw = 0;
     }
-    control->thrust = setpoint->mode.z == modeAbs && isfinite(sum) ? 30000.0f : 0.0f;
+    control->thrust = setpoint->mode.z != modeDisable && isfinite(of_state + asked + setpoint->attitude.yaw)
+                          ? 30000.0f + 1000.0f * asked
+                          : 0.0f;
 }
 
 void powerDistribution(const control_t *control, motors_thrust_uncapped_t *thrust) {

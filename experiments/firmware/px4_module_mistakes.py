@@ -66,7 +66,12 @@ def mistakes(name: str) -> dict[str, list[Mutant]]:
         "arming check of another": [("= request.request_id", "= 0")],
         "not unregistered": [("request.mode_id = _mode_id;", "")],
         "never in place of Offboard": [("_param_offboard.get()", "false")],
-        "a removed mode stays": [("!(request.valid_registrations_mask & (1u << _arming_check_id))", "false")],
+        "a removed mode stays": [("++_unlisted >= REMOVED", "false")],
+        "one arming check removes the mode": [("++_unlisted >= REMOVED", "true")],
+        "arming checks that are not in a row": [("_unlisted = 0;\n\n", "")],
+        "no answer while it is not listed": [
+            ("arming_check_reply_s reply{};", "if (_unlisted) { return; } arming_check_reply_s reply{};")
+        ],
         "may be armed in this mode": [("mode_req_prevent_arming = true", "mode_req_prevent_arming = false")],
         "dead reckoning taken for a position": [(" && !position.dead_reckoning", "")],
         "torque left at a fault": [(f"_who == {name.upper()}_FLIES && _on)", "_who < 0)")],

@@ -45,9 +45,12 @@ def _registration(module: Module) -> Iterator[str]:
     vehicle.tick(BEGIN_US + 1_700_000, row, mode=0)
     if not c.configured():
         yield "PX4's controllers stay on"
-    other = _on(module)
-    other.tick(BEGIN_US + 2_000_000, row, mode=0, check=2)
-    orders = other.tick(BEGIN_US + 2_010_000, row).published
+    other = _on(module)  # beside another mode, whose arming check began before; 1 lists this one, 2 does not
+    for i, check in enumerate((2, 2, 1, 2, 2)):
+        if not other.tick(BEGIN_US + 2_000_000 + 300_000 * i, row, mode=0, check=check).able or c.asked():
+            yield "an arming check that does not list the mode is not answered, or taken for its removal"
+    other.tick(BEGIN_US + 3_500_000, row, mode=0, check=2)
+    orders = other.tick(BEGIN_US + 3_510_000, row).published
     if orders or not c.asked():
         yield "a mode that the commander has removed gives orders, or is not asked for again"
     if not c.stopped(vehicle.pointer):

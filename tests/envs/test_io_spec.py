@@ -57,6 +57,28 @@ def test_rotor_speeds_reach_down_to_the_least_thrust() -> None:
     assert [port.low for port in io_spec.actions(tasks.load("any"))] == [0.0] * 4
 
 
+def test_a_tilted_motors_axis_is_told() -> None:
+    """As a unit vector; the port of an upright one says body z."""
+    spec = tasks.load("hover")
+    assert isinstance(spec, tasks.QuadrotorTask)
+    tilted = [
+        motor.model_copy(update={"axis": (0.0, 0.6 * s, 0.8)})
+        for s, motor in zip((1, 1, -1, -1), spec.vehicle.motors, strict=True)
+    ]
+    vehicle = spec.vehicle.model_copy(update={"motors": (*tilted[:1], *spec.vehicle.motors[1:3], *tilted[3:])})
+    ports = io_spec.actions(spec.model_copy(update={"vehicle": vehicle}))
+    assert [port.axis for port in ports] == [
+        (0.0, pytest.approx(0.6), 0.8),
+        *[(0.0, 0.0, 1.0)] * 2,
+        (0.0, pytest.approx(-0.6), 0.8),
+    ]
+    assert [port.frame for port in ports] == [
+        "thrust along its axis",
+        *["thrust along body z"] * 2,
+        "thrust along its axis",
+    ]
+
+
 def test_ports_of_the_pendulum() -> None:
     task = tasks.load("pendulum")
     found = io_spec.observations(task)

@@ -34,10 +34,12 @@ from experiments.firmware.betaflight_loop import (
     ned,
     set_point,
 )
-from experiments.firmware.crazyflie_loop import World
+from experiments.firmware.crazyflie_loop import Mutant, World
 from experiments.firmware.emitted import emitted as written
 from qrl.export import kernel as integers
+from qrl.export import targets
 from qrl.export.firmware import betaflight
+from qrl.export.firmware.vehicle import c_float
 from qrl.export.policy import Policy
 from qrl.export.quantize import quantize
 from qrl_envs import task as tasks
@@ -69,6 +71,7 @@ UNFIT = {
     "a corner": (lambda: changed(recurrent(), 1, position_m=(0.03, -0.03)), r"rear right \(1\), and the vehicle has 0"),
     "spins": (lambda: changed(recurrent(), 1, spin=-1), "do not turn as a quad X's do"),
     "unit": (lambda: changed(recurrent(), 2, unit="1", quantity="duty"), "neither thrusts"),
+    "tilted": (lambda: changed(recurrent(), 2, axis=(0.0, 0.1, 0.995)), r"the vehicle's are tilted \(f3\)"),
 }
 
 
@@ -132,8 +135,10 @@ def test_a_hook_of_zeros_is_off(tmp_path: Path) -> None:
     assert hook.run(vehicle, ned(still, 0), set_point(loop.REST, 0), 0)[0] == SELFTEST
 
 
-def test_time_outs_faults_and_hand_over(tmp_path: Path) -> None:
-    hook, still = Hook(emitted(steady(), tmp_path), NAME, tmp_path / "b"), np.eye(13)[6]
+# Linked without start-up files: those of -ffast-math would make this process flush denormals to zero.
+@pytest.mark.parametrize("flags", [(), (*targets.FIRMWARE, "-nostartfiles")], ids=["strict", "firmware"])
+def test_time_outs_faults_and_hand_over(flags: tuple[str, ...], tmp_path: Path) -> None:
+    hook, still = Hook(emitted(steady(), tmp_path), NAME, tmp_path / "b", flags=flags), np.eye(13)[6]
     vehicle, now = hook.boot(), 2**32 - 2000
 
     def run(now_us: int, estimate: Estimate | None = None, to: SetPoint | None = None) -> int:
@@ -163,19 +168,31 @@ def test_time_outs_faults_and_hand_over(tmp_path: Path) -> None:
             setattr(estimate if hasattr(estimate, field) else to, field, (9_000_000 - age) % 2**32)
             assert run(9_000_000, estimate, to) == expected
         assert run(9_010_000) == fault  # until the next start
-    for index in (0, 4, 7, 11):
-        hook.start(vehicle, 0)
-        assert run(0, ned(still, 0)) == FLIES
-        bad = ned(still, 0)
-        for name, size in (("position", 3), ("velocity", 3), ("attitude", 4), ("w", 3)):
-            if 0 <= index < size:
-                getattr(bad, name)[index] = math.nan
-            index -= size
-        assert run(10_000, bad) == NOT_FINITE
+    places = [(0, field) for field in ("position", "velocity", "attitude", "w")]
+    places += [(1, field) for field in ("position", "velocity", "acceleration", "jerk", "yaw_rad")]
+    for which, field in places:
+        for number in (math.nan, math.inf):
+            hook.start(vehicle, 0)
+            assert run(0, ned(still, 0)) == FLIES
+            given = ned(still, 10_000), set_point(loop.REST, 10_000)
+            if field == "yaw_rad":
+                given[1].yaw_rad = number
+            else:
+                getattr(given[which], field)[1] = number
+            assert run(10_000, *given) == NOT_FINITE
     hook.start(vehicle, 0)
     none = ned(still, 0)
     none.attitude[0] = 0.5
     assert run(0, none) == NOT_FINITE
+
+
+@pytest.mark.parametrize("c", [-0.1, 0.0, 0.5, 0.99999, 1.0])
+def test_a_thrust_is_that_of_its_command(c: float, tmp_path: Path) -> None:
+    policy = steady()
+    mutant = Mutant(f"c = {c_float(policy.actions[0].thrust_curve)}", f"c = {c_float(c)}")
+    hook, thrusts = Hook(emitted(policy, tmp_path), NAME, tmp_path / "b", mutant), np.linspace(0.0, 1.0, 101)
+    w = np.array([hook.command(thrust) for thrust in thrusts])
+    np.testing.assert_allclose(w * (c + (1.0 - c) * w), thrusts, atol=2e-6)
 
 
 def test_it_flies_as_the_kernel_does_and_mistakes_do_not(tmp_path: Path) -> None:

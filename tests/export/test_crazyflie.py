@@ -151,6 +151,11 @@ def changed(policy: Policy, index: int, **changes: object) -> Policy:
     return replace(policy, actions=tuple(ports))
 
 
+def wide(units: int) -> Policy:
+    """With a hidden layer of so many units."""
+    return replace(policies.policy((18, units, 4)), actions=flying("hover", "crazyflie"))
+
+
 UNFIT = {
     "pendulum": (lambda: policies.policy(policies.PENDULUM), "observation is not"),
     "units of its own": (lambda: policies.policy((18, 4, 3)), "observation is not"),
@@ -169,6 +174,8 @@ UNFIT = {
         "motors are 100 mm from the center, and a Crazyflie's 46 to 50 mm",
     ),
     "unit": (lambda: changed(recurrent(), 2, unit="1", quantity="duty"), "neither thrusts"),
+    "wide": (lambda: wide(352), "its two buffers take 1,408 of the stabilizer's 1,800 bytes of stack"),
+    "tilted": (lambda: changed(recurrent(), 2, axis=(0.0, 0.1, 0.995)), r"the vehicle's are tilted \(f3\)"),
     "heading": (
         lambda: replace(
             recurrent(), observations=recurrent().observations[:18] + policies.policy(policies.ODD).observations[:3]
@@ -210,6 +217,12 @@ def test_the_files_are_whole() -> None:
     assert (
         "CONFIG_CRAZYFLIE_21_PLUS=y\n" in crazyflie.files(of_vehicle("crazyflie"), kernel, NAME)["crazyflie/app-config"]
     )
+
+
+@pytest.mark.parametrize(("units", "words"), [(8, 600), (64, 600), (348, 884)])
+def test_the_apps_stack_is_for_the_widest_layer(units: int, words: int) -> None:
+    files = crazyflie.files(wide(units), {f"{NAME}.c": "", f"{NAME}.h": ""}, NAME)
+    assert f"CONFIG_APP_STACKSIZE={words}\n" in files["crazyflie/app-config"]
 
 
 def test_another_platform_does_not_compile(built: Built) -> None:

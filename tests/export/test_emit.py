@@ -88,7 +88,7 @@ def strict_json(text: str) -> dict:
 
 
 def test_the_manifest_keeps_its_contract() -> None:
-    """DESIGN.md, "Kernel"."""
+    """Its keys, which other tools read (docs/deploy.md)."""
     found = strict_json(files()["manifest.json"])
     kernel = policies.kernel()
     assert list(found)[:6] == ["format", "name", "task", "vehicle", "run", "commit"]
@@ -116,6 +116,13 @@ def test_the_manifest_keeps_its_contract() -> None:
         assert set(port) == {"name", "unit", "frame", "position_m", "spin", "range", "lsb", "safe"}
         assert port["range"] == [0.0, pytest.approx(0.667 * 9.81 / 4 + 6.0, rel=1e-3)]
         assert port["safe"] == pytest.approx(1.636, abs=1e-3)
+
+
+def test_the_manifest_has_the_axis_of_a_tilted_motor() -> None:
+    policy, axis = policies.policy(), (0.0, 0.1, 0.995)
+    tilted = replace(policy, actions=(replace(policy.actions[0], axis=axis), *policy.actions[1:]))
+    first, second, *_ = strict_json(files(policy=tilted)["manifest.json"])["act"]
+    assert (first["axis"], "axis" in second) == (list(axis), False)
 
 
 def test_the_pendulums_manifest_has_no_motors() -> None:
@@ -308,13 +315,16 @@ def test_the_example_says_when_its_self_test_fails(exported: Exported, tmp_path:
     assert done.stdout.startswith("self-test 1 failed")
 
 
-def test_the_example_builds_with_cmake(exported: Exported, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", [NAME, "policy", "all"])
+def test_the_example_builds_with_cmake(name: str, tmp_path: Path) -> None:
+    """Whatever CMake's own targets and those of other examples are called."""
     if not shutil.which("cmake"):
         pytest.skip("missing here: cmake")
-    folder = shutil.copytree(exported[ODD, "tanh"], tmp_path / "export")
+    kernel = policies.kernel(ODD, "tanh")
+    folder = policies.emitted(tmp_path / "export", policies.policy(ODD, "tanh"), kernel, name=name).parent
     run("cmake", "-S", str(folder / EXAMPLE), "-B", str(tmp_path / "build"), cwd=tmp_path)
     run("cmake", "--build", str(tmp_path / "build"), cwd=tmp_path)
-    assert run("./policy", cwd=tmp_path / "build").startswith("a0 a1: ")
+    assert run(f"./{name}_example", cwd=tmp_path / "build").startswith("a0 a1: ")
 
 
 def test_cpp_may_call_it(exported: Exported, tmp_path: Path) -> None:

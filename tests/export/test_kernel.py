@@ -130,11 +130,12 @@ def layered(rng: np.random.Generator, sizes: tuple[int, ...], activation: str = 
         for i, o in pairwise(sizes)
     )
     inputs, outputs = sizes[0], sizes[-1]
+    low, high = np.sort(rng.integers(-INT16, INT16 + 1, (2, inputs)), axis=0)
     return Kernel(
         scale=rng.integers(2**15, 2**16, inputs),
         exponent=rng.integers(130, 160, inputs),
-        obs_min=rng.integers(-INT16, 1, inputs),
-        obs_max=rng.integers(0, INT16 + 1, inputs),
+        obs_min=low,
+        obs_max=high,
         layers=layers,
         activation=activation,
         act_lsb=np.full(outputs, 1e-3, np.float32),
@@ -162,7 +163,7 @@ def test_the_bound_is_attained_and_never_passed(seed: int) -> None:
     rng = np.random.default_rng(seed)
     kernel = layered(rng, (int(rng.integers(1, 40)), 8))
     (layer,) = kernel.layers
-    kernel = replace(kernel, obs_min=-kernel.obs_max)
+    kernel = replace(kernel, obs_min=-abs(kernel.obs_max), obs_max=abs(kernel.obs_max))
     bound = accumulator_bound(kernel)
     worst = [np.sign(w) * kernel.obs_max * (1 if b >= 0 else -1) for w, b in zip(layer.weight, layer.bias, strict=True)]
     accumulated = np.array(worst) @ layer.weight.T + layer.bias

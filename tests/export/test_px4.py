@@ -178,6 +178,7 @@ def test_refusals() -> None:
         (replace(good, observation_clip=np.where(clip == 1.0, 2.0, clip)), "inputs 13 to 15 are not clipped at 1"),
         (replace(good, observation_clip=np.where(np.arange(22) == 16, 9.0, clip)), "does not clip"),
         (replace(good, actions=swapped), "the motors are not"),
+        (replace(good, actions=tuple(replace(port, axis=(0.0, 0.1, 0.995)) for port in good.actions)), "are tilted"),
     ]
     for policy, reason in bad:
         assert reason in (px4.checkpoint_refusal(policy) or "")

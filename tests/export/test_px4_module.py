@@ -54,7 +54,7 @@ def world() -> World:
 
 
 REASONS = {
-    **{case: UNFIT[case] for case in ("pendulum", "six motors", "unit")},
+    **{case: UNFIT[case] for case in ("pendulum", "six motors", "unit", "tilted")},
     "a corner": (UNFIT["a corner"][0], r"there is one motor front right \(1\), and the vehicle has 2"),
     "a spin": (lambda: changed(recurrent(), 1, spin=-1), r"back right \(4\) has spin \+1, and the vehicle's \(f2\) -1"),
     "a circle": (lambda: around_a_circle(recurrent()), "the center of a circle that it flies"),
@@ -110,6 +110,15 @@ def test_names_are_as_long_as_px4_takes_and_differ() -> None:
         found |= {parameter[1], mode[1]}
     assert len(found) == 4
     assert f"px4::params::{parameter[1]}>" in str(files[f"{source}/{name}_mode.hpp"])
+
+
+def test_each_name_has_a_class_of_its_own() -> None:
+    names, found = ("hover2", "hover_2", "Hover2", "_2d"), set[str]()
+    for name in names:
+        files = px4.files(recurrent(), {f"{name}.c": "", f"{name}.h": ""}, name)
+        header = str(files[f"px4/module/src/modules/{name}/{name}_mode.hpp"])
+        found |= set(re.findall(r"^class ([A-Za-z_]\w*) final", header, re.MULTILINE))
+    assert len(found) == len(names)
 
 
 def test_it_compiles_for_a_flight_controller(tmp_path: Path) -> None:

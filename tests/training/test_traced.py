@@ -19,18 +19,18 @@ APG = {"apg_fraction": 0.4, "apg_num_envs": 4, "apg_episode_length": 20}
 
 
 class Counting(PendulumEnv):
-    """Counts how often it is traced."""
+    """Counts how often it is traced, copies of it with other parameters too."""
 
     def __init__(self) -> None:
         super().__init__(task.load("pendulum"))
-        self.traces = 0
+        self.traces: list[str] = []  # shared by copies
 
     def step(self, state: State, action: jax.Array) -> State:
-        self.traces += 1
+        self.traces.append("step")
         return super().step(state, action)
 
     def reset(self, rng: jax.Array) -> State:
-        self.traces += 1
+        self.traces.append("reset")
         return super().reset(rng)
 
 
@@ -38,7 +38,7 @@ def flown(out: Path, store: Store | None, **changes: object) -> int:
     """How often a run's environment was traced."""
     env = Counting()
     train(out, run_config(**APG, **changes), env, store=store)
-    return env.traces
+    return len(env.traces)
 
 
 def assert_same_runs(ours: Path, expected: Path) -> None:

@@ -67,7 +67,7 @@ def kernel_name(run: TrainedRun, name: str | None) -> str:
     if not emit.is_name(name):
         raise BadInput(
             f"--name '{name}': expected a C identifier of at most {emit.MAX_NAME} characters that is no header of the"
-            " C library, such as hover"
+            " C library or of a firmware, such as hover"
         )
     return name
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from qrl.export import kernel as reference
 from qrl.export.kernel import Dense, Integral, Ints, Kernel, Memory
-from qrl.export.policy import Policy
+from qrl.export.policy import UP, Policy
 from qrl.export.vectors import Vectors, embedded
 
 FORMAT = 2
@@ -22,16 +22,20 @@ FRAMES = " * World and body frames: x forward, y left, z up. SI units.\n *"
 
 
 MAX_NAME = 64
-# A header of this name would be found in place of the C library's.
+# A file of this name would stand for a header of the C library, or of a firmware beside whose files it is put.
 RESERVED = {
     *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
     *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),
     *("wchar", "wctype"),
+    *("app", "controller", "controller_pid", "debug", "freertos", "log", "neural_network", "nn_controller", "param"),
+    *("platform", "platform_defaults", "task", "usec_time"),
+    "bare_metal",  # the folder of the other example
+    *("changed", "golden", "last", "next"),  # with _state or _step a variable's of the sources around the kernel
 }
 
 
 def is_name(name: str) -> bool:
-    """Whether it can prefix the symbols of a kernel: a C identifier, and no header of the C library."""
+    """Whether it can prefix the symbols of a kernel: a C identifier, and not `RESERVED`."""
     valid = re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) and len(name) <= MAX_NAME
     return bool(valid) and name.lower() not in RESERVED
 
@@ -77,6 +81,7 @@ def manifest(policy: Policy, kernel: Kernel, name: str) -> dict[str, Any]:
     act = []
     for a, limits, lsb in zip(policy.actions, _act_ranges(kernel), kernel.act_lsb.tolist(), strict=True):
         motor = {} if a.position_m is None else {"position_m": list(a.position_m), "spin": a.spin}
+        motor |= {} if a.axis == UP else {"axis": list(a.axis)}
         quantity = {} if a.quantity is None else {"quantity": a.quantity}
         port = {"name": a.name, "unit": a.unit, **quantity, "frame": a.frame, **motor, "range": limits, "lsb": lsb}
         act.append(port | {"safe": float(np.float32(a.safe))})
@@ -177,7 +182,7 @@ def _values(policy: Policy, kernel: Kernel, golden: Vectors, name: str) -> dict[
         "act_names": " ".join(port.name for port in policy.actions),
         "example_obs": _floats(golden.obs[0]),
         "acc_bound": f"{reference.accumulator_bound(kernel):,}",
-        "widest": str(_widest(kernel)),
+        "widest": str(widest(policy)),
         "tanh": str(int(kernel.activation == "tanh")),
         "tables": _tables(kernel, golden, name),
     }
@@ -237,14 +242,14 @@ def _padded(n: int, to: int = 4) -> int:
     return -(-n // to) * to
 
 
-def _widest(kernel: Kernel) -> int:
-    """Of all that a buffer of activations holds."""
-    widest = max(_padded(len(kernel.scale)), *(size for layer in _layers(kernel) for size in layer.shape))
-    if unit := kernel.unit:
-        given = unit.of_input.weight.shape[1]
-        widest = max(widest, _padded(given, 8) + _padded(unit.units, 8))
-        widest = max(widest, _padded(2 * unit.units) + 2 * _padded(unit.units))
-    return widest
+def widest(policy: Policy) -> int:
+    """How many numbers each of the kernel's two buffers of activations holds."""
+    sizes = [len(policy.observations), *(size for weight, _ in policy.layers for size in weight.shape)]
+    found = max(map(_padded, sizes))
+    if policy.unit:
+        given, units = policy.unit.of_input[0].shape[0], policy.unit.of_memory[0].shape[0]
+        found = max(found, _padded(given, 8) + _padded(units, 8), _padded(2 * units) + 2 * _padded(units))
+    return found
 
 
 class _Layer(NamedTuple):

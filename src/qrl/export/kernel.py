@@ -223,8 +223,8 @@ def _check_fields(kernel: Kernel) -> None:
     ranges: list[tuple[str, Ints, Ints | int, Ints | int]] = [
         ("an input's scale", kernel.scale, 2**15, 2**16 - 1),
         ("an input's exponent", kernel.exponent, -(2**15), INT16),
-        ("an input's range", kernel.obs_min, -INT16, 0),
-        ("an input's range", kernel.obs_max, 0, INT16),
+        ("an input's range", kernel.obs_min, -INT16, kernel.obs_max),
+        ("an input's range", kernel.obs_max, kernel.obs_min, INT16),
         ("an input's shift", kernel.obs_shift, 0, 15),
         ("an action's range", np.concatenate([kernel.act_min, kernel.act_max]), -INT16, INT16),
     ]

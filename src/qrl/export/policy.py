@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+UP = (0.0, 0.0, 1.0)
+
 
 @dataclass(frozen=True)
 class ObservationSpec:
@@ -33,6 +35,7 @@ class ActionSpec:
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
     quantity: str | None = None  # where `unit` does not say it
     thrust_curve: float = 0.0  # of a motor, c: thrust is c·w + (1 − c)·w² of its greatest, w its speed of its greatest
+    axis: tuple[float, float, float] = UP  # of a motor: direction of its thrust in the body frame
 
     @property
     def limits(self) -> tuple[float, float]:

@@ -78,8 +78,8 @@ def _quantized(policy: Policy, ridge: float) -> Kernel:
     kernel = Kernel(
         scale=scale,
         exponent=exponent,
-        obs_min=np.clip(np.round(floor[:measured] / lsb), -most, 0).astype(np.int64),
-        obs_max=np.clip(np.round(ceiling[:measured] / lsb), 0, most).astype(np.int64),
+        obs_min=np.clip(np.round(floor[:measured] / lsb), -most, most).astype(np.int64),
+        obs_max=np.clip(np.round(ceiling[:measured] / lsb), -most, most).astype(np.int64),
         layers=(),
         activation=policy.activation,
         act_lsb=act_lsb,

@@ -114,9 +114,12 @@ def _verification(kernel: Kernel, verification: VerificationReport) -> Iterable[
             " infinities, NaN."
         )
         if verification.steps:
+            host, core = verification.steps
+            slow = [cost.core for cost in verification.costs if cost.core.share > 1]
+            fewer = "".join(f" ({core // each.share:,} on {each.name})" for each in slow)
             yield (
-                "- The same for the state after each, in sequences; and on smooth sequences of {:,} steps on the host,"
-                " {:,} on a core (where it has a tenth of the inputs, a tenth).".format(*verification.steps)
+                f"- The same for the state after each, in sequences; and on smooth sequences of {host:,} steps on the"
+                f" host, {core:,} on a core{fewer}."
             )
     yield from (f"- Skipped {line}." for line in verification.skipped)
     yield ""

@@ -140,6 +140,11 @@ def golden(policy: Policy, kernel: Kernel, n: int = 256) -> Vectors:
     return with_outputs(kernel, obs, obs_i16, 1 if kernel.memory is None else n)
 
 
+def least(size: int) -> int:
+    """As many vectors of so many numbers as `observations` needs to have ten of each kind that is random."""
+    return 2 * (5 + 5 * size + 2 * len(EXTREMES) + 40)
+
+
 def observations(policy: Policy, kernel: Kernel, n: int, seed: int = 0) -> NDArray[np.float32]:
     """n float32 vectors [n, F]: half from the policy's flights; then the corners of the ranges, values beyond them,
     random values within, whole and half steps, denormals, infinities, NaN, and random bits.

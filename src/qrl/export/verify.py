@@ -16,7 +16,6 @@ from qrl.export.vectors import Outputs, Vectors
 
 SEQUENCES = 2
 HOST_STEPS, CORE_STEPS = 6_000, 600  # of each sequence
-LEAST = 300  # vectors of each entry point, so that there are some of each kind
 
 
 class Cost(NamedTuple):
@@ -55,7 +54,8 @@ def verify(policy: Policy, kernel: Kernel, source: Path, n: int) -> Verification
         return [vectors.draw(policy, kernel, n), *long]
 
     on_host = drawn(n, HOST_STEPS)
-    on_core = {share: drawn(max(n // share, LEAST), CORE_STEPS // share) for share in {core.share for core in CORES}}
+    least, shares = vectors.least(len(policy.observations)), {core.share for core in CORES}
+    on_core = {share: drawn(max(n // share, least), CORE_STEPS // share) for share in shares}
     passed, skipped, costs = [], [], []
     with TemporaryDirectory() as work, ThreadPoolExecutor(os.cpu_count()) as pool:
         jobs: list[tuple[str, Future[Cost | None]]] = []

@@ -48,7 +48,9 @@ typedef struct {
 typedef struct {
     uint32_t timestamp; /* ms */
     attitude_t attitude;
+    attitude_t attitudeRate; /* deg/s */
     quaternion_t attitudeQuaternion;
+    float thrust;
     point_t position;     /* m */
     velocity_t velocity;  /* m/s */
     acc_t acceleration;   /* m/s^2 */

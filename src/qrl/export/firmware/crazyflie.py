@@ -7,6 +7,7 @@ Facts of the firmware are those of its release 2026.08: `src/platform/interface/
 import math
 from typing import NamedTuple
 
+from qrl.export.emit import widest
 from qrl.export.firmware import vehicle
 from qrl.export.firmware.vehicle import Corner, arm_m, mass_kg
 from qrl.export.policy import WORLD_SIZE, Policy
@@ -23,6 +24,8 @@ MOTORS = (
 MOST_ARM_RATIO = 1.3  # of a motor's distance from the center, by which a vehicle may differ from the platform
 MOST_HOVER = 0.8  # of a motor's greatest thrust
 MAIN_LOOP_US = 1000
+STABILIZER_STACK, OTHER_FRAMES = 1800, 400  # bytes of its task; those around the kernel's two buffers
+APP_STACK, APP_WIDTH = 600, 64  # words of the app's task, for buffers of so many numbers
 
 
 class Platform(NamedTuple):
@@ -79,6 +82,8 @@ def refusal(policy: Policy) -> str | None:
     period_us = round(policy.control_period_s * 1e6)
     if period_us % MAIN_LOOP_US or period_us < MAIN_LOOP_US:
         return f"a control period of {policy.control_period_s * 1e3:g} ms is no whole number of the main loop's 1 ms"
+    if (frame := 4 * widest(policy)) + OTHER_FRAMES > STABILIZER_STACK:
+        return f"its two buffers take {frame:,} of the stabilizer's {STABILIZER_STACK:,} bytes of stack"
     order = vehicle.by_place_and_spin(policy, MOTORS)
     if isinstance(order, str):
         return f"of a Crazyflie's motors, {order}"
@@ -146,6 +151,7 @@ def _values(policy: Policy, name: str) -> dict[str, str]:
         "name": name,
         "NAME": name.upper(),
         "period_ms": f"{policy.control_period_s * 1e3:.0f}",
+        "app_stack": f"{APP_STACK + max(widest(policy) - APP_WIDTH, 0)}",
         **{f"m{number}": policy.actions[i].name.upper() for number, i in enumerate(order, 1)},
         "preview": vehicle.preview(policy, name, "setpoint->acceleration.{axis}", "setpoint->jerk.{axis}"),
         "fraction": _fraction(policy),

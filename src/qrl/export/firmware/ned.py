@@ -45,7 +45,9 @@ SPEED = "    const float share = of_most; /* it is a rotor's speed */"
 THRUST = """\
     /* A thrust, of the greatest: c w + (1 - c) w^2 of a rotor's speed w, as the vehicle was trained with. */
     const float c = {c}, thrust = of_most > 0.0f ? of_most : 0.0f;
-    const float share = c < 1.0f ? (sqrtf(c * c + 4.0f * (1.0f - c) * thrust) - c) / (2.0f * (1.0f - c)) : thrust;"""
+    /* Rationalized, so that a c near 1 does not cancel; with c below 0 no thrust would be 0 / 0. */
+    const float root = sqrtf(c * c + 4.0f * (1.0f - c) * (thrust > 1e-6f ? thrust : 1e-6f));
+    const float share = 2.0f * thrust / (c + root);"""
 
 
 def facts(policy: Policy) -> list[str]:

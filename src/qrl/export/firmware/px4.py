@@ -77,6 +77,8 @@ def checkpoint_refusal(policy: Policy) -> str | None:
             return f"its inputs {part.start + 1} to {part.stop} are not clipped at {most:g}, as mc_raptor does"
     if np.isfinite(np.delete(limits, np.r_[9:15])).any():
         return "inputs are clipped that mc_raptor does not clip"
+    if reason := vehicle.tilted(policy):
+        return reason
     order = vehicle.by_place_and_spin(policy, MOTORS)
     return f"the motors are not those of PX4's quadrotor X: {order}" if isinstance(order, str) else None
 
@@ -195,7 +197,7 @@ def _module(policy: Policy, kernel: dict[str, str], name: str) -> dict[str, str]
     values = {
         "name": name,
         "NAME": name.upper(),
-        "class": "".join(part.capitalize() for part in name.split("_")) + "Mode",
+        "class": f"{name}_mode",
         "mode": _cut(name, MOST_MODE),
         "parameter": _cut(name, MOST_PARAMETER - len(OFFBOARD)).upper() + OFFBOARD,
         "request_id": str(zlib.crc32(name.encode())),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from qrl.export.policy import WORLD_SIZE, Policy
+from qrl.export.policy import UP, WORLD_SIZE, Policy
 
 TEMPLATES = Path(__file__).parent / "templates"
 MEASURED = [
@@ -40,7 +40,13 @@ def misfit(policy: Policy) -> str | None:
         return f"it orders four motors, and the policy has {len(policy.actions)} actions"
     if not (orders_speeds(policy) or all(port.unit == "N" for port in policy.actions)):
         return "the motors are ordered neither thrusts [N] nor fractions of their greatest speed"
-    return None
+    return tilted(policy)
+
+
+def tilted(policy: Policy) -> str | None:
+    """Why a policy fits no vehicle whose motors all push along body z; None if it does."""
+    names = ", ".join(port.name for port in policy.actions if port.axis != UP)
+    return f"all motors push along body z, and the vehicle's are tilted ({names})" if names else None
 
 
 def flies(policy: Policy) -> bool:

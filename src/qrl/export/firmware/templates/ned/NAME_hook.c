@@ -12,9 +12,12 @@
 #error "four motors"
 #endif
 
+/* By their bits: with -ffast-math, as Betaflight is built, isfinite is always true. */
 static bool all_finite(const float *numbers, const int count) {
     for (int i = 0; i < count; ++i) {
-        if (!isfinite(numbers[i])) {
+        uint32_t bits;
+        memcpy(&bits, numbers + i, sizeof bits);
+        if ((bits >> 23 & 255u) == 255u) {
             return false;
         }
     }
@@ -30,11 +33,11 @@ static bool old(const uint32_t now_us, const uint32_t then_us, const uint32_t mo
 static bool usable(const @name@_estimate *estimate, const @name@_setpoint *setpoint) {
     const float *q = estimate->attitude;
     const float square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-    return square > 0.9f && square < 1.1f && /* false for NaN */
-           all_finite(estimate->position_m, 3) && all_finite(estimate->velocity_m_s, 3) &&
-           all_finite(estimate->rates_rad_s, 3) && all_finite(setpoint->position_m, 3) &&
-           all_finite(setpoint->velocity_m_s, 3) && all_finite(setpoint->acceleration_m_s2, 3) &&
-           all_finite(setpoint->jerk_m_s3, 3) && isfinite(setpoint->yaw_rad);
+    return all_finite(q, 4) && square > 0.9f && square < 1.1f && all_finite(estimate->position_m, 3) &&
+           all_finite(estimate->velocity_m_s, 3) && all_finite(estimate->rates_rad_s, 3) &&
+           all_finite(setpoint->position_m, 3) && all_finite(setpoint->velocity_m_s, 3) &&
+           all_finite(setpoint->acceleration_m_s2, 3) && all_finite(setpoint->jerk_m_s3, 3) &&
+           all_finite(&setpoint->yaw_rad, 1);
 }
 
 /* Writes a vector given in north, east, down to out in the policy's world: z up, x along the heading of the set-point. */

@@ -63,8 +63,9 @@ static uint32_t last_step, next_step, changed_step;
 
 static quaternion_t seen_attitude; /* of the estimate when it last changed */
 static velocity_t seen_velocity;
-static state_t last_state; /* the last that were finite */
+static state_t last_state; /* the last that were finite, which the stock controller is given */
 static sensorData_t last_sensors;
+static setpoint_t last_setpoint;
 
 static uint8_t arm = 0;
 static uint16_t setpoint_ms = 250;
@@ -94,6 +95,30 @@ static bool usable(const state_t *state, const sensorData_t *sensors) {
            isfinite(state->position.x) && isfinite(state->position.y) && isfinite(state->position.z) &&
            isfinite(state->velocity.x) && isfinite(state->velocity.y) && isfinite(state->velocity.z) &&
            isfinite(sensors->gyro.x) && isfinite(sensors->gyro.y) && isfinite(sensors->gyro.z);
+}
+
+/* Whether what a set-point asks for is finite: a place and a velocity only where its modes ask for them. */
+static bool asks_for_numbers(const setpoint_t *setpoint) {
+    const setpoint_mode_t *mode = &setpoint->mode;
+    const quaternion_t q = setpoint->attitudeQuaternion;
+    const attitude_t angle = setpoint->attitude, rate = setpoint->attitudeRate;
+    const bool place = mode->x == modeAbs || mode->y == modeAbs || mode->z == modeAbs;
+    const bool moves = mode->x == modeVelocity || mode->y == modeVelocity || mode->z == modeVelocity;
+    const float turn = angle.roll + angle.pitch + angle.yaw + rate.roll + rate.pitch + rate.yaw + q.x + q.y + q.z + q.w;
+    return isfinite(turn + setpoint->thrust) &&
+           (!place || isfinite(setpoint->position.x + setpoint->position.y + setpoint->position.z)) &&
+           (!moves || isfinite(setpoint->velocity.x + setpoint->velocity.y + setpoint->velocity.z));
+}
+
+/* What is not finite would stay in the filters of the stock controller: it is given the last that was. */
+static void keep(const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state) {
+    if (usable(state, sensors) && isfinite(state->attitude.roll + state->attitude.pitch + state->attitude.yaw)) {
+        last_state = *state;
+        last_sensors = *sensors;
+    }
+    if (asks_for_numbers(setpoint)) {
+        last_setpoint = *setpoint;
+    }
 }
 
 static uint8_t decide(const setpoint_t *setpoint, const uint32_t step) {
@@ -233,6 +258,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
         changed_step = step;
     }
     watch(state, step);
+    keep(setpoint, sensors, state);
     who = decide(setpoint, step);
     if (who == POLICY) {
         if (before != POLICY || !continued) {
@@ -254,14 +280,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
         if (who >= STOCK_STATE_OLD) {
             fault = who;
         }
-        /* Numbers that are not finite would stay in the filters of the stock controller. */
-        const bool substitute = fault == STOCK_NOT_FINITE && !usable(state, sensors);
-        fly_stock(control, setpoint, substitute ? &last_sensors : sensors, substitute ? &last_state : state, step,
-                  before == POLICY || !continued);
-    }
-    if (usable(state, sensors)) {
-        last_state = *state;
-        last_sensors = *sensors;
+        fly_stock(control, &last_setpoint, &last_sensors, &last_state, step, before == POLICY || !continued);
     }
     last_step = step;
 }

@@ -95,8 +95,13 @@ void @class@::reply_to_arming_check(const hrt_abstime now_us)
 		return;
 	}
 
-	if (!(request.valid_registrations_mask & (1u << _arming_check_id))) { // the commander has removed it: to be asked for anew
+	// A request of before the registration does not list it. Several in a row: the commander has removed it.
+	if (request.valid_registrations_mask & (1u << _arming_check_id)) {
+		_unlisted = 0;
+
+	} else if (++_unlisted >= REMOVED) { // to be asked for anew
 		_mode_id = _arming_check_id = -1;
+		_unlisted = 0;
 		_on = false;
 		return;
 	}

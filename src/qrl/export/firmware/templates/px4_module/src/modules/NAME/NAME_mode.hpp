@@ -53,6 +53,7 @@ public:
 private:
 	static constexpr uint64_t REQUEST_ID = @request_id@; // of the registration; of the module's name
 	static constexpr hrt_abstime REQUEST_US = 1000000; // between requests, until one is granted
+	static constexpr int REMOVED = 3; // arming checks in a row that do not list the mode
 
 	void Run() override;
 
@@ -106,6 +107,7 @@ private:
 	hrt_abstime _requested_us{0};
 	int8_t _mode_id{-1};
 	int8_t _arming_check_id{-1};
+	int _unlisted{0}; // such arming checks until now
 
 	perf_counter_t _loop_perf{perf_alloc(PC_ELAPSED, MODULE_NAME": cycle")};
 
