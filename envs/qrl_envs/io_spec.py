@@ -1,9 +1,10 @@
 """Names, units and frames of a task's observations and actions, and the map from actions to SI units."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from qrl_envs.task import QuadrotorTask, Task
-from qrl_envs.vehicle import Vehicle
+
+UP = (0.0, 0.0, 1.0)
 
 
 class ObservationPort(NamedTuple):
@@ -29,7 +30,7 @@ class ActionPort(NamedTuple):
     position_m: tuple[float, ...] | None = None  # of a motor: x, y or x, y, z in the body frame
     spin: int | None = None  # of a motor: +1 if its reaction torque is positive about body z
     quantity: str | None = None  # where `unit` does not say it
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)  # of a motor: the direction of its thrust in the body frame
+    axis: tuple[float, float, float] = UP  # of a motor: the direction of its thrust in the body frame
     thrust_curve: float = 0.0  # of a motor, c: thrust is c·w + (1 − c)·w² of its greatest, w its speed of its greatest
 
 
@@ -75,6 +76,7 @@ def actions(task: Task) -> list[ActionPort]:
         limit, frame = task.rod.max_torque_N_m, "about the pivot, positive counter-clockwise"
         return [ActionPort("torque", "N m", frame, offset=0.0, scale=limit, low=-limit, high=limit, safe=0.0)]
     vehicle = task.vehicle
+    axes: list[Any] = [tuple(map(float, axis)) for axis in vehicle.motor_axes.T]
     if task.action == "rotor_speed":
         return [
             ActionPort(
@@ -88,7 +90,7 @@ def actions(task: Task) -> list[ActionPort]:
                 safe=round(float(speed), 4),
                 position_m=motor.position_m,
                 spin=motor.spin,
-                axis=_axis(vehicle, i),
+                axis=axes[i - 1],
                 quantity="rotor speed fraction",
             )
             for i, (motor, speed, least) in enumerate(
@@ -100,7 +102,7 @@ def actions(task: Task) -> list[ActionPort]:
         ActionPort(
             name=f"f{i}",
             unit="N",
-            frame="thrust along body z" if _axis(vehicle, i) == (0.0, 0.0, 1.0) else "thrust along its axis",
+            frame="thrust along body z" if axes[i - 1] == UP else "thrust along its axis",
             offset=hover[i - 1],
             scale=vehicle.action_scale_N,
             low=motor.min_N,
@@ -108,14 +110,8 @@ def actions(task: Task) -> list[ActionPort]:
             safe=hover[i - 1],
             position_m=motor.position_m,
             spin=motor.spin,
-            axis=_axis(vehicle, i),
+            axis=axes[i - 1],
             thrust_curve=vehicle.thrust_curve,
         )
         for i, motor in enumerate(vehicle.motors, 1)
     ]
-
-
-def _axis(vehicle: Vehicle, i: int) -> tuple[float, float, float]:
-    """The unit vector along which motor `i`, from 1, pushes; body frame."""
-    x, y, z = (float(part) for part in vehicle.motor_axes[:, i - 1])
-    return x, y, z
