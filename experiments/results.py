@@ -1,4 +1,4 @@
-"""The numbers of README's tables: docs/results.json, from runs of the shipped presets with seed 100.
+"""The numbers of README's tables: docs/results.json, from runs of the shipped presets with seeds 100 to 102.
 
     .venv/bin/python -m experiments.results [--out FILE] [--runs FOLDER] [--fresh] [--list]
     .venv/bin/python -m experiments.results --check README.md …
@@ -31,7 +31,7 @@ from qrl.runs.record import RunConfig
 from qrl_envs.specfile import BadInput
 
 RESULTS, RUNS = Path("docs/results.json"), Path("experiments/out/results")
-SEEDS = (100,)
+SEEDS = (100, 101, 102)
 NO_APG = {"apg_fraction": 0.0, "num_timesteps": 4_500_000}
 WITHOUT_APG, WITH_APG = "without APG (the paper's learner, with symmetries)", "with APG"
 STEADY = (  # measure, label, factor, format, unit
