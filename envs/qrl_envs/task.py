@@ -482,6 +482,15 @@ def _without(lagged: dict[str, Any], given: dict[str, Any], form: str | None) ->
     return left
 
 
+def _described(reward: Any) -> dict[str, str]:
+    """The description of a circle of another size, speed or sense, which is that of the shipped one else."""
+    radius_m, speed_m_s = (reward.get(key) if isinstance(reward, dict) else None for key in ("radius_m", "speed_m_s"))
+    if not (_positive(radius_m) and isinstance(speed_m_s, int | float)):
+        return {}  # what is wrong with them is said later
+    sense = "counter-clockwise" if speed_m_s > 0.0 else "clockwise"
+    return {"description": f"fly a {radius_m:g} m circle at {abs(speed_m_s):g} m/s, {sense}, from any attitude"}
+
+
 def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
     """`data` merged over the shipped task that its key `extend` names, if any."""
     if "extend" not in data:
@@ -495,4 +504,5 @@ def extended(data: dict[str, Any], where: str) -> dict[str, Any]:
         raise BadInput(f"{where}: key '{LAGGED}': expected an object")
     form = shipped_base["reward"].get("form") if "reward" in shipped_base else None
     lagged = specfile.merge(_without(shipped_base.get(LAGGED, {}), given, form), given.get(LAGGED, {}))
-    return specfile.merge(shipped_base, given) | {LAGGED: lagged}
+    merged = specfile.merge(shipped_base, given) | {LAGGED: lagged}
+    return merged | _described(merged.get("reward")) if base == "circle" and "description" not in given else merged

@@ -442,6 +442,7 @@ def test_circles_of_any_size_and_sense(path: Path) -> None:
         mine = load(path, circle_of(radius, speed))
         assert isinstance(mine.reward, task.CircleReward)
         assert mine.reward.w5_direction_s_m2 == 0.5 / radius
+        assert f"a {radius:g} m circle at {abs(speed):g} m/s, {'counter-' * (speed > 0)}clockwise," in mine.description
     for radius, speed, words in ((0.2, 6.0, "180 m/s²"), (1.0, 0.0, "clockwise"), (30.0, 3.0, "bounds.distance_m")):
         with pytest.raises(BadInput, match=words):
             load(path, circle_of(radius, speed))
