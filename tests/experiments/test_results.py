@@ -69,6 +69,7 @@ def test_the_commit_is_that_of_the_run(
         return 1.0
 
     monkeypatch.setattr(results, "ROWS", results.ROWS[:2])
+    monkeypatch.setattr(results, "SEEDS", (100,))
     monkeypatch.setattr(results, "train", train)
     monkeypatch.setattr(results.runs, "qrl", lambda *_: None)
     found = results.measure(tmp_path, fresh=False)
