@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from qrl_envs import measures, own_vehicle, plant, quadrotor, rewards, symmetry
 from qrl_envs.reference import Reference
 from qrl_envs.symmetry import Symmetry
-from qrl_envs.target import Figure, Lap, Motion, Target, follow
+from qrl_envs.target import Figure, Motion, Periodic, Target, follow
 from qrl_envs.task import QuadrotorTask
 from qrl_envs.task_env import Evaluation, Params, State, TaskEnv
 from qrl_envs.uncertainty import Uncertainty
@@ -136,7 +136,7 @@ class RealQuadrotorEnv(QuadrotorEnv):
         self._sizes = sum(parts), len(task.vehicle.motors)
         self._layout = (shaped_for or uncertainty).layout(task.control_period_s)
 
-    def _followed(self, spec: Reference | None, anywhere: bool) -> Figure | Lap | Motion | None:
+    def _followed(self, spec: Reference | None, anywhere: bool) -> Figure | Periodic | Motion | None:
         """The reference that `spec` describes, in flight; on one that is known, flights may begin anywhere."""
         return None if spec is None else follow(spec, self.task.control_period_s, self.task.preview_s, anywhere)
 

@@ -4,6 +4,7 @@ file, or smooth random motion to train on. World frame, SI units; heading is no 
 Those that are known beforehand give position, velocity and acceleration at any time; `target` has them in flight.
 """
 
+import abc
 import csv
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -67,12 +68,12 @@ class Sine(NamedTuple):
     phase_rad: np.ndarray
 
 
-class Lap(Base):
+class Periodic(Base):
     """What repeats: a sine along each axis."""
 
     @property
-    def sine(self) -> Sine:
-        raise NotImplementedError
+    @abc.abstractmethod
+    def sine(self) -> Sine: ...
 
     def at(self, times_s: np.ndarray) -> Kinematics:
         center, size, rate, phase = self.sine
@@ -80,7 +81,7 @@ class Lap(Base):
         return Kinematics(center + size * np.sin(angle), size * rate * np.cos(angle), -size * rate**2 * np.sin(angle))
 
 
-class Lissajous(Lap):
+class Lissajous(Periodic):
     """center + amplitude_m·sin(2π·cycles·t/period_s + phase_rad) along each axis.
 
     A figure-eight has the cycles 1, 2, 0; a circle 1, 1, 0 and a phase of π/2 along x.
@@ -113,7 +114,7 @@ class Lissajous(Lap):
         return Sine(np.array(self.center_m), np.array(self.amplitude_m), rate, np.array(self.phase_rad))
 
 
-class Circle(Lap):
+class Circle(Periodic):
     """A horizontal circle about center_m; a speed above 0 is counter-clockwise seen from above."""
 
     form: Literal["circle"]

@@ -2,7 +2,7 @@
 ahead: the reference's velocity then minus its velocity now. For one flight; the caller vmaps, or lets flights lie along
 trailing axes.
 
-`Figure` and `Lap` are known beforehand; `Motion` is drawn for each flight.
+`Figure` and `Periodic` are known beforehand; `Motion` is drawn for each flight.
 """
 
 from collections.abc import Sequence
@@ -63,10 +63,10 @@ class Figure(Known):
         return Target(now[:3], now[3:], jnp.concatenate(preview) if preview else now[:0])
 
 
-class Lap(Known):
+class Periodic(Known):
     """One that repeats, in closed form: for as long as a flight is."""
 
-    def __init__(self, spec: reference.Lap, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
+    def __init__(self, spec: reference.Periodic, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> None:
         super().__init__((spec.lap_s or 0.0) if anywhere else 0.0, dt_s)
         self._sine, self._ahead_s = spec.sine, [round(time_s / dt_s) * dt_s for time_s in ahead_s]
 
@@ -132,11 +132,11 @@ class Motion:
         return Target(jnp.sum(size * sine, axis=1), velocity, jnp.concatenate(preview) if preview else velocity[:0])
 
 
-def follow(spec: Reference, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> Figure | Lap | Motion:
+def follow(spec: Reference, dt_s: float, ahead_s: Sequence[float], anywhere: bool) -> Figure | Periodic | Motion:
     """A reference in flight, at steps of `dt_s` and with a preview of the times `ahead_s`; flights may begin `anywhere`
     on one that is known.
     """
     if isinstance(spec, Random):
         return Motion(spec, dt_s, ahead_s)
-    kind = Lap if isinstance(spec, reference.Lap) else Figure
+    kind = Periodic if isinstance(spec, reference.Periodic) else Figure
     return kind(spec, dt_s, ahead_s, anywhere)  # pyright: ignore[reportArgumentType]
